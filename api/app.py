@@ -49,14 +49,12 @@ _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
 def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
-    """Create the application with given services, or with its own services, opened and closed by it."""
+    """Create the application; without `services` it opens its own, and closes them at its end."""
     proxy = Proxy(settings)
     keys = KeyFile(settings.resolved_keys_file, closed=proxy.is_on)
     if not (proxy.is_on or keys.has_live_key or is_loopback(settings.host)):
-        raise InputError(
-            f"{settings.host} is reachable from other machines and there is no valid key; "
-            "make one with `graspd keys add NAME --scope admin`, or bind 127.0.0.1"
-        )
+        problem = f"{settings.host} is reachable from other machines and there is no valid key"
+        raise InputError(f"{problem}; make one with `graspd keys add NAME --scope admin`, or bind 127.0.0.1")
     opened = services or Services.open(settings)
     if services is None:
         identify_if_redis_answers(opened)
@@ -82,11 +80,9 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
         redirect_slashes=False,
     )
     app.state.settings = settings
-    app.state.keys, app.state.proxy = keys, proxy
+    app.state.keys, app.state.proxy, app.state.metrics = keys, proxy, Metrics()
     provide(app, opened)
-    app.state.metrics = Metrics()
-    app.state.uploads, app.state.forms = RequestLimiter(UPLOADS), RequestLimiter(FORMS)
-    app.state.exports = RequestLimiter(EXPORTS)
+    app.state.uploads, app.state.forms, app.state.exports = map(RequestLimiter, (UPLOADS, FORMS, EXPORTS))
     problems.install_handlers(app, problem_page)
     pages.install(app, opened)
     for router in (*_ROUTERS, *map(asset_router, AssetKind), *datasets.routers, *pages.routers):
@@ -100,7 +96,7 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
 
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Proxy, rates: Rates) -> None:
-    """Add middleware, inner first: HEAD, body limits, authentication, rates, origin, request ids, prefix."""
+    """Add middleware, innermost first."""
     app.add_middleware(Head)
     uploads = frozenset({*(f"/v1/{kind.value}s" for kind in AssetKind), "/submit"})
     app.add_middleware(BodyLimit, upload_paths=uploads, upload_bytes=settings.max_upload_bytes)
@@ -111,9 +107,7 @@ def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Prox
     if prefix := settings.api_root_path:
         first = prefix.split("/")[1]
         if first in {str(getattr(route, "path", "/")).split("/")[1] for route in app.routes}:
-            raise InputError(
-                f"GRASPD_API_ROOT_PATH: the service itself uses the path /{first}; choose another one, such as /graspd"
-            )
+            raise InputError(f"GRASPD_API_ROOT_PATH: the service itself uses the path /{first}; choose another path")
         app.add_middleware(RootPath, prefix=prefix)
 
 
@@ -121,15 +115,14 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
     """Return the OpenAPI document, with problem documents in place of FastAPI's own error schema."""
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
-        schemas = document.setdefault("components", {}).setdefault("schemas", {})
-        schemas.pop("HTTPValidationError", None)
-        schemas.pop("ValidationError", None)
+        schemas = document["components"]["schemas"]
+        del schemas["HTTPValidationError"], schemas["ValidationError"]
         problem = problems.Problem.model_json_schema(ref_template="#/components/schemas/{model}")
         schemas |= problem.pop("$defs")
         schemas["Problem"] = problem
         for path, operations in document["paths"].items():
             for method, operation in operations.items():
-                answers = operation.setdefault("responses", {})
+                answers = operation["responses"]
                 if "application/json" in answers.get("422", {}).get("content", {}):
                     answers["422"] = problems.problem_responses(422)[422]
                 for status, answer in problems.problem_responses(*_middleware_statuses(path, method)).items():

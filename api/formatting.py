@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import shlex
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from datetime import datetime
 from typing import Any, Final
 
@@ -89,20 +90,14 @@ def stamp(value: str) -> str:
     return datetime.fromisoformat(value).strftime("%Y-%m-%d %H:%M UTC")
 
 
+#: Words for the kind of a scene; free grasps have none.
 _PLACES: Final = {"table": "on a table", "bin": "in a bin", "shelf": "on a shelf", "file": "in a scene of their own"}
-
-
-def scene_kind(kind: str) -> str:
-    """Describe the kind of a scene in words; empty for free grasps."""
-    return _PLACES.get(kind, "")
-
-
 FILTERS: Final[Mapping[str, Callable[..., str]]] = {
     "metric": metric,
     "count": count,
     "percent": percent,
     "valid_yield": valid_yield,
-    "place": scene_kind,
+    "place": lambda kind: _PLACES.get(kind, ""),
     "duration": duration,
     "worker_time": worker_time,
     "bytes": size,
@@ -112,9 +107,6 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
 
 
 def is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
+    with suppress(ValueError):
         return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    return host == "localhost"

@@ -23,13 +23,9 @@ class Metrics:
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
-        counted, timed = SERIES["graspd_http_requests_total"], SERIES["graspd_http_request_seconds"]
-        self._requests = Counter(
-            counted.name.removesuffix("_total"), counted.meaning, counted.labels, registry=self.registry
-        )
-        self._seconds = Histogram(
-            timed.name, timed.meaning, timed.labels, registry=self.registry, buckets=HTTP_BUCKETS_S
-        )
+        count, time = SERIES["graspd_http_requests_total"], SERIES["graspd_http_request_seconds"]
+        self._requests = Counter(count.name, count.meaning, count.labels, registry=self.registry)
+        self._seconds = Histogram(time.name, time.meaning, time.labels, registry=self.registry, buckets=HTTP_BUCKETS_S)
 
     def observe(self, method: str, route: str, status: int, seconds: float) -> None:
         self._requests.labels(method, route, str(status)).inc()
@@ -96,8 +92,7 @@ def _families(sums: Mapping[str, float]) -> Iterable[Metric]:
     found: Values = defaultdict(dict)
     for text, amount in sums.items():
         if (parsed := parse_field(text)) is not None:
-            name, labels = parsed
-            found[name][labels] = amount
+            found[parsed[0]][parsed[1]] = amount
     for series in SERIES.values():
         if series.source != "controller":
             continue

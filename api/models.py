@@ -38,7 +38,7 @@ class Job(Validated):
     fidelity: str
     requested: int = Field(description="grasps requested")
     standing: Literal["valid", "feasible", "kept"] = Field(
-        "valid", description="kind of its stored grasps: valid, feasible (not validated) or kept (all candidates)"
+        "valid", description="stored grasps: valid ones, feasible ones (not validated), or all candidates (kept)"
     )
     progress: float = Field(ge=0, le=1)
     eta_s: float | None = Field(None, description="expected time until the job ends [s]; null if unknown")
@@ -64,14 +64,10 @@ class Diversity(BaseModel):
 
     grasps: int = Field(description="number of grasps analysed")
     types: dict[str, int] = Field(description="number of grasps by type; `none`: undefined type")
-    type_entropy_bits: float = Field(
-        description="entropy of the types; 0: a single type; 1.58: three types in equal numbers"
-    )
+    type_entropy_bits: float = Field(description="entropy of the types; 0: one type; 1.58: three equal types")
     directions_used: int = Field(description="approach cells with grasps; directions are in the object's frame")
     directions: int = Field(DIRECTION_CELLS, description="number of cells, all of equal area")
-    direction_entropy_bits: float = Field(
-        description="entropy of the directions; 0: a single cell; 5.58: all 48 cells in equal numbers"
-    )
+    direction_entropy_bits: float = Field(description="entropy of the directions; 0: one cell; 5.58: 48 equal cells")
     evenness: float = Field(ge=0, le=1, description="2^entropy of the directions, divided by the number of cells")
 
 
@@ -89,16 +85,12 @@ class JobDetail(Job):
     object_digest: str
     choice: Choice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
     note: str | None = Field(None, description="why fewer grasps than requested were found; null if enough")
-    outcomes: dict[str, int] = Field(
-        {}, description="rejected candidates by outcome, if the job found fewer grasps than requested"
-    )
+    outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome, if the job found too few grasps")
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
     recheck_held: int = Field(0, description="rechecked grasps that held")
     attempts: list[AttemptView]
     mean: MeanMetrics
-    diversity: Diversity | None = Field(
-        None, description="diversity of the valid grasps (all stored ones if not validated); null without grasps"
-    )
+    diversity: Diversity | None = Field(None, description="null without grasps")
     shards: list[Shard]
 
 
@@ -111,9 +103,7 @@ class GraspQuery(BaseModel):
     job: str | None = Field(None, max_length=64)
     dataset: str | None = Field(None, max_length=64, description="grasps of the cells of this dataset")
     tag: str | None = Field(None, max_length=64, description="grasps with this tag")
-    where: str | None = Field(
-        None, max_length=LONGEST, description="filter expression, such as `epsilon > 0.3 and lift and robust >= 0.75`"
-    )
+    where: str | None = Field(None, max_length=LONGEST, description="filter expression: `epsilon > 0.3 and lift`")
     hand: str | None = Field(None, max_length=64)
     object: str | None = Field(None, max_length=64)
     validated: bool | None = Field(None, description="whether the validator gave a verdict")
@@ -121,7 +111,7 @@ class GraspQuery(BaseModel):
     success: bool | None = None
     type: Literal["power", "precision", "lateral"] | None = Field(None, description="grasp type")
     scene: Literal["free", "table", "bin", "shelf", "file", "any"] | None = Field(
-        None, description="kind of scene in which it was planned; any: all except free"
+        None, description="kind of the scene in which it was planned; any: all kinds except free"
     )
     neighbours: bool | None = Field(None, description="whether the scene has neighbours")
     lift_hard: bool | None = Field(None, description="lifted at half friction")
@@ -133,7 +123,7 @@ class GraspQuery(BaseModel):
 
 
 class Posture(BaseModel):
-    """Hand posture in the object frame."""
+    """Posture of the hand in the object frame."""
 
     hand_pose: list[float] = Field(description="pose of the root link: x y z [m], quaternion w x y z")
     joint_positions: list[float] = Field(description="joint positions in the order of joint_names [rad or m]")
@@ -193,9 +183,7 @@ class GraspDetail(GraspView):
     validated_by: Literal["mujoco", "mujoco_warp"] | None = Field(
         None, description="engine of the verdict: MuJoCo on the CPU (the reference) or MuJoCo Warp (the prefilter)"
     )
-    recheck: bool | None = Field(
-        None, description="verdict under the unmodified DexGraspBench protocol; null if not rechecked"
-    )
+    recheck: bool | None = Field(None, description="verdict at level `dexgraspbench`; null if not rechecked")
     friction: float | None = Field(None, description="Coulomb coefficient of the metrics")
 
 
@@ -262,9 +250,7 @@ class Health(BaseModel):
 
     ok: bool = Field(description="whether redis, index and store respond")
     parts: dict[str, Part]
-    controller: bool = Field(
-        False, description="whether a controller sent a heartbeat recently; without a controller no task is queued"
-    )
+    controller: bool = Field(False, description="whether a controller sent a heartbeat recently; it queues all tasks")
     workers: int = Field(0, ge=0, description="number of workers with a recent heartbeat, except quarantined ones")
 
 

@@ -57,9 +57,9 @@ class Problem(BaseModel):
     type: str = Field(description="URI reference of the problem type; its page describes it")
     title: str
     status: int
-    detail: str = Field(description="what is wrong and the fix, in one line")
+    detail: str = Field(description="the error and its fix, in one line")
     instance: str = Field(description="path of the request")
-    request_id: str | None = Field(None, description="the same as in header X-Request-Id and in the log")
+    request_id: str | None = Field(None, description="equal to header X-Request-Id and the id in the log")
     errors: list[FieldError] | None = None
 
 
@@ -94,9 +94,8 @@ def problem_response(
     headers = dict(headers or {})
     if status in (429, 503):
         headers.setdefault("Retry-After", str(RETRY_AFTER_S))
-    return JSONResponse(
-        problem.model_dump(exclude_none=True), status_code=status, media_type=MEDIA_TYPE, headers=headers
-    )
+    content = problem.model_dump(exclude_none=True)
+    return JSONResponse(content, status_code=status, media_type=MEDIA_TYPE, headers=headers)
 
 
 def describe(error: Exception) -> tuple[str, str, int, str]:
@@ -116,7 +115,7 @@ def describe(error: Exception) -> tuple[str, str, int, str]:
 
 
 def _is_full(error: BaseException | None) -> bool:
-    """Check whether the disk was full: FastAPI reports a failed read of a body as a bad request."""
+    """Check whether the disk was full; FastAPI hides this cause behind a bad request."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -127,27 +126,25 @@ def replace_surrogates(text: str) -> str:
 
 def error_response(request: Request, error: Exception) -> JSONResponse:
     slug, title, status, detail = describe(error)
+    headers = dict(getattr(error, "headers", None) or {})
     if isinstance(error, HTTPException) and status == 404:
         detail = f"there is no {request.url.path}"
     if isinstance(error, HTTPException) and status == 405:
         detail = f"{request.method} is not possible on {request.url.path}"
-    headers = dict(getattr(error, "headers", None) or {})
-    # The router lists only the methods of the first matching route; an ApiError has its own header.
-    if status == 405 and not isinstance(error, ApiError) and (allowed := _allowed_methods(request)):
-        headers["Allow"] = ", ".join(allowed)
+        # The router lists only the methods of the first matching route.
+        if allowed := _allowed_methods(request):
+            headers["Allow"] = ", ".join(allowed)
     return problem_response(request, slug=slug, title=title, status=status, detail=detail, headers=headers)
 
 
 def _allowed_methods(request: Request) -> list[str]:
-    """Return the methods of all routes at this path (RFC 9110 §15.5.6); a route knows only its own."""
-    return [
-        method
-        for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
-        if any(
-            route.matches(dict(request.scope) | {"method": "GET" if method == "HEAD" else method})[0] is Match.FULL
-            for route in request.app.routes
-        )
-    ]
+    """Return the methods of all routes at the path of a request (RFC 9110 §15.5.6)."""
+
+    def is_allowed(method: str) -> bool:
+        scope = dict(request.scope) | {"method": "GET" if method == "HEAD" else method}
+        return any(route.matches(scope)[0] is Match.FULL for route in request.app.routes)
+
+    return [method for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE") if is_allowed(method)]
 
 
 def validation_answer(request: Request, error: RequestValidationError) -> JSONResponse:
@@ -193,11 +190,11 @@ def install_handlers(app: FastAPI, page: Callable[[Request, dict[str, Any]], Res
             return page(request, facts | {"request_id": request_id_of(request)})
         return error_response(request, error)
 
+    # Coroutines, because starlette would run plain functions in a thread.
     async def any_error(request: Request, error: Exception) -> Response:
         return answer_any(request, error)
 
-    async def bad_request(request: Request, error: Exception) -> JSONResponse:
-        assert isinstance(error, RequestValidationError)
+    async def bad_request(request: Request, error: Any) -> Response:
         return validation_answer(request, error)
 
     app.state.answer_error = answer_any

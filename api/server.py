@@ -1,8 +1,7 @@
-"""Server of the application: one uvicorn server in this process, on a socket that is bound first.
+"""One uvicorn server for the application, in this process, on a socket that is bound first.
 
-uvicorn limits the time between requests; `BodyLimit` limits the time between pieces of a body. `TimedProtocol` limits
-two further kinds of connections: those with partial or no headers, and those whose body continues after the response.
-No code reads such a body, and each of its bytes restarts uvicorn's limit.
+uvicorn limits the time between requests, and `BodyLimit` the time between pieces of a body. `TimedProtocol` limits the
+time for headers, and for the rest of a body after its response: each byte of this rest restarts uvicorn's limit.
 """
 
 from __future__ import annotations
@@ -48,8 +47,7 @@ def configuration(app: ASGIApp, settings: Settings) -> uvicorn.Config:
         app,
         http=TimedProtocol,
         ws="none",
-        # A trusted proxy may state any client address and so evade limits per address. No proxy, including loopback, is
-        # trusted unless the variable lists it.
+        # A trusted proxy may state any client address, and so evade limits per address; so none is trusted by default.
         proxy_headers=bool(os.environ.get("FORWARDED_ALLOW_IPS")),
         log_config=None,
         access_log=False,
@@ -62,9 +60,9 @@ def configuration(app: ASGIApp, settings: Settings) -> uvicorn.Config:
 class TimedProtocol(H11Protocol):
     """HTTP/1.1 connection with time limits that single bytes do not extend."""
 
-    #: Limit from the start of a connection, or the first byte of a later request, to the end of its headers [s].
+    #: Time limit from the start of a connection, or the first byte of a later request, to the end of its headers [s].
     headers_s = 20.0
-    #: Time limit for the rest of a body after its response [s]: a client that still sends may read the response first.
+    #: Time limit for the rest of a body after its response [s].
     rest_s = 5.0
     _patience: asyncio.TimerHandle | None = None
 

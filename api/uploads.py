@@ -30,6 +30,7 @@ def files_of_upload(
 ) -> MutableMapping[str, bytes]:
     """Return the files of an uploaded asset, including `asset.json`; `options` override keys of this file."""
     leaf = PurePosixPath(filename.replace("\\", "/")).name
+    suffix = PurePosixPath(leaf).suffix.lower()
     file = io.BytesIO(data) if isinstance(data, bytes) else data
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
@@ -39,11 +40,11 @@ def files_of_upload(
         raise InputError(f"the upload {leaf or 'without a name'} is empty; choose a file with content")
     if kind is AssetKind.NETWORK:
         # An .npz is a ZIP itself, so it is not unpacked.
-        if PurePosixPath(leaf).suffix.lower() not in MAIN_SUFFIXES[kind]:
+        if suffix not in MAIN_SUFFIXES[kind]:
             raise InputError(f"{leaf} is no network; upload an .npz file")
         check_size(size, leaf)
         files: MutableMapping[str, bytes] = {NETWORK_FILE: file.read()}
-    elif PurePosixPath(leaf).suffix.lower() == ".zip":
+    elif suffix == ".zip":
         files = ZipFiles(file, limit_bytes=limit_bytes * UNPACK_FACTOR).without_common_folder()
     else:
         files = {check_path(leaf): file.read()}
@@ -69,12 +70,10 @@ def name_of_upload(filename: str) -> str:
 def _main_file(kind: AssetKind, upload: str, files: Mapping[str, bytes]) -> str:
     suffixes = MAIN_SUFFIXES[kind]
     found = [name for name in sorted(files) if PurePosixPath(name).suffix.lower() in suffixes]
-    known = ", ".join(suffixes)
     if not found:
+        known = ", ".join(suffixes)
         raise InputError(f"{upload} holds no {kind.value} file; upload one of {known}, or a ZIP of the folder")
     if len(found) > 1:
         names = ", ".join(found[:5])
-        raise InputError(
-            f'{upload} holds several {kind.value} files ({names}); add an asset.json that says {{"file": ...}}'
-        )
+        raise InputError(f'{upload} holds several {kind.value} files ({names}); add an asset.json with {{"file": ...}}')
     return found[0]

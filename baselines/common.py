@@ -1,7 +1,7 @@
 """Common parts of the baselines: hand and object, collision-free starts, inner surfaces, grasp sets.
 
-Baselines use flat triangles of the object (no Phong smoothing). Pregrasp, squeeze and quality come from the same code
-as in `fast_graspd`, and so do starts that a publication does not define."""
+Baselines use flat triangles of the object (no Phong smoothing). Pregrasp and squeeze come from the same code as in
+`fast_graspd`, and so do starts that a publication does not define."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _lock: Final = threading.Lock()
 
 
 def cached_search(make: Callable[..., T], pair: Pair, *options: object) -> T:
-    """Return `make(pair, *options)`; the most recent results are cached."""
+    """Return `make(pair, *options)`; cache the eight most recent results."""
     key = (make, id(pair), *options)
     with _lock:
         if key not in _searches:
@@ -50,7 +50,7 @@ def cached_search(make: Callable[..., T], pair: Pair, *options: object) -> T:
 
 
 def load_pair(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleType) -> Pair:
-    """Return hand and object on a device; load the caller's kernel modules, in one thread at a time."""
+    """Return hand and object on a device; compile the modules `kernels`, in one thread at a time."""
     pair = pair_of(hand, obj, GROUND, device)
     with _lock:
         for module in kernels:
@@ -71,7 +71,7 @@ def frame_along(z: Floats) -> Floats:
 
 
 def grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object]) -> GraspSet:
-    """Return hands as grasps with all postures; `began` is the planner's start by `time.perf_counter`."""
+    """Return hands as grasps with pregrasp and squeeze; `began` is the planner's start by `time.perf_counter` [s]."""
     hand, obj, device = pair.hand.model, pair.fine.obj.model, pair.hand.device
     seconds = time.perf_counter() - began
     grasp = posture_of(hand, obj, state)
@@ -79,15 +79,14 @@ def grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object
     return GraspSet(grasp, opened, pressed, np.full(len(grasp), np.nan), seconds=seconds, info=info)
 
 
-#: Inner side: surface that moves within 45 degrees of its normal when the fingers close; on the palm, surface that
-#: faces along the approach.
+#: Cosine of the angle between normal and closing motion, or approach for the palm, above which a point is inside.
 INSIDE_COS: Final = 0.7
 SAMPLES: Final = 1200
 STEP: Final = 1e-4
 
 
 def inner_side_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoints:
-    """Spread points evenly on the inner side: at most `each` per closing link, `on_palm` on the palm."""
+    """Spread points evenly on the surfaces that close: at most `each` per closing link, `on_palm` on the palm."""
     points = sample_surface(hand, SAMPLES)
     inside = _inside(hand, points)
     chosen: list[NDArray[np.intp]] = []

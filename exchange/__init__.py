@@ -1,1 +1,1 @@
-"""Conversion of grasps: importers return postures in graspd's frames, exporters convert its shards."""
+"""Import and export of other projects' formats: importers return postures in graspd's frames."""

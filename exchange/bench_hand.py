@@ -1,7 +1,7 @@
 """Hands in DexGraspBench's layout: MJCF model with position actuators, configuration, map of joints.
 
-The model's world frame is the frame of graspd's root link, so `qpos` begins with this link's pose. Bodies are named
-`root_<link>` and `f<number of the finger>_<link>`: the evaluator finds fingers by the prefix of a body's name."""
+The model's world frame is the frame of graspd's root link, so `qpos` begins with this link's pose. Names of bodies are
+`root_<link>` and `f<number of the finger>_<link>`, because the evaluator finds fingers by prefix."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
 
-#: Joint damping over position gain [s], as in DexGraspBench's Allegro hand.
-_DAMPING_TIME: Final = 0.02
-#: Stiffness of couplings. They are stiffer than contacts; otherwise a pressed finger would stretch them.
+_DAMPING_TIME: Final = 0.02  # joint damping over position gain [s], as in DexGraspBench's Allegro hand
+#: Stiffness of couplings: larger than that of contacts, so that contacts do not stretch couplings.
 _COUPLING: Final = {"solref": "0.008 1", "solimp": "0.98 0.999 0.0001 0.5 2"}
+#: Least mass of a body [kg], and radius of the ball that is the inertia of a body without pieces [m].
 _BARE: Final = {"mass": 1e-3, "radius": 0.01}
 _COLOUR: Final = (0.87, 0.45, 0.2, 1.0)
 
@@ -45,14 +45,13 @@ def write_hand(hand: HandModel, config: str, root: Path) -> Path:
 
 
 def body_names(hand: HandModel) -> tuple[str, ...]:
+    """Return the names (L,) of the hand's bodies in the model."""
     return tuple(f"{'root' if b == 0 else _finger(hand, b)}_{name}" for b, name in enumerate(hand.body_names))
 
 
 def _finger(hand: HandModel, body: int) -> str:
     """Return the finger of a body, numbered by the child of the root that leads to the body."""
-    while hand.parent[body] > 0:
-        body = int(hand.parent[body])
-    return f"f{np.flatnonzero(hand.parent == 0).tolist().index(body)}"
+    return f"f{np.flatnonzero(hand.parent == 0).tolist().index(hand.chain(body)[-1])}"
 
 
 def _configuration(hand: HandModel, model: Path) -> str:
@@ -144,7 +143,7 @@ def _shape(piece: ConvexPiece, number: int) -> dict[str, str]:
 
 
 def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
-    """Add position actuators on the first joint of each dof and on tendons; couple the other joints."""
+    """Add position actuators for the first joint of each dof and for tendons; couple all other joints."""
     pulled = {d: tendon for tendon in hand.tendons for d in tendon.dofs}
     for d, name in enumerate(hand.dof_names):
         if (tendon := pulled.get(d)) is not None:
@@ -172,12 +171,11 @@ def _text(values: Any) -> str:
     return " ".join(f"{float(value):.12g}" for value in values)
 
 
-#: Folder of an experiment's grasps; the mapping file is in the parent folder.
+#: Folders of an experiment with grasps, and with grasps collected for training; the mapping is in the parent folder.
 GRASPS: Final = "graspdata"
-#: Folder of grasps that were collected for training.
 COLLECTED: Final = "succ_collect"
 FILE: Final = "hand_mapping.json"
-#: Folders of files with the same fields: grasps, and results of the evaluator.
+#: Folders of grasps and of results of the evaluator, which have the same fields.
 _FOLDERS: Final = (GRASPS, COLLECTED, "evaluation", "succgrasp")
 
 
@@ -187,8 +185,7 @@ class HandMapping:
 
     hand: str
     root_link: str
-    config: str
-    """Value of the benchmark's option `hand`: the configuration that names the model."""
+    config: str  # value of the benchmark's option `hand`: the configuration that names the model
     model: str
     root_in_model: tuple[float, ...]
     """(7,) pose of graspd's root link in the frame of the model's root; m, w x y z."""
@@ -201,7 +198,8 @@ class HandMapping:
         return np.concatenate([compose(root, invert(np.array(self.root_in_model))), joints[self._order(hand)]])
 
     def posture(self, hand: HandModel, qpos: Floats) -> tuple[Floats, Floats]:
-        """Return graspd's root poses (N, 7) and joints (N, J) from `qpos` (N, 7 + J)."""
+        """Return graspd's root poses (N, 7) and joints (N, J) from `qpos` (N, 7 + J).
+        Raises InputError, like `qpos`: the hand has another root link or other joints."""
         joints = np.empty_like(qpos[:, 7:])
         joints[:, self._order(hand)] = qpos[:, 7:]
         return compose(qpos[:, :7], np.array(self.root_in_model)), joints
@@ -222,7 +220,7 @@ class HandMapping:
 
 
 def mapping_of(file: Path) -> HandMapping | None:
-    """Load the mapping of the experiment to which a grasp file belongs; None if there is none."""
+    """Load the mapping of a grasp file's experiment; None if there is none. Raises InputError: it is invalid."""
     for above in file.resolve().parents:
         if above.name in _FOLDERS:
             return _read(above.parent / FILE)
@@ -264,16 +262,13 @@ _SHADOW_ROOT: Final = (0.0, 0.0, 0.034, 1.0, 0.0, 0.0, 0.0)
 
 def benchmark_mapping(hand: HandModel) -> HandMapping | None:
     """Return the mapping to DexGraspBench's own model of the hand; None if it has none."""
+
+    def mapping(config: str, root: tuple[float, ...], joints: tuple[tuple[str, str], ...]) -> HandMapping:
+        return HandMapping(hand.name, hand.root_link, config, f"assets/hand/{config}/right_hand.xml", root, joints)
+
     for names in _ALLEGRO_URDFS:
         if set(names) == set(hand.joint_names) and hand.root_link in ("base_link", "palm"):
-            joints = tuple(zip(_ALLEGRO, names, strict=True))
-            return _published_mapping(hand, "allegro", _ALLEGRO_ROOT, joints)
+            return mapping("allegro", _ALLEGRO_ROOT, tuple(zip(_ALLEGRO, names, strict=True)))
     if set(_SHADOW) == set(hand.joint_names) and hand.root_link == "palm":
-        return _published_mapping(hand, "shadow", _SHADOW_ROOT, tuple((f"rh_{name}", name) for name in _SHADOW))
+        return mapping("shadow", _SHADOW_ROOT, tuple((f"rh_{name}", name) for name in _SHADOW))
     return None
-
-
-def _published_mapping(
-    hand: HandModel, config: str, root: tuple[float, ...], joints: tuple[tuple[str, str], ...]
-) -> HandMapping:
-    return HandMapping(hand.name, hand.root_link, config, f"assets/hand/{config}/right_hand.xml", root, joints)

@@ -1,9 +1,7 @@
 """Objects and scenes in DexGraspBench's layout, and grasps on a table in its tabletop test's format.
 
 Files of an object are its mesh, convex pieces, measurements, and scenes. In a scene the object floats at scale 1 or is
-on a table. Poses on a table are in the table's frame: z up, top at z = 0, where the evaluator has a floor. Grasps on a
-table have two more fields, for arms. `approach_qpos` (W, 7 + J) leads the open hand from the standoff to the pregrasp.
-`lift_qpos` (7 + J,) is the raised squeeze. The evaluator itself raises a hand without an arm."""
+on a table. Poses on a table are in the table's frame: z up, top at z = 0, where the evaluator has a floor."""
 
 from __future__ import annotations
 
@@ -30,10 +28,8 @@ from graspd.worker.validation.decomposition import decompose
 
 Row = dict[str, Any]
 
-#: Folder of scenes with a table, and part of the name of an experiment.
-TABLETOP: Final = "tabletop"
-#: Tolerance of equal positions [m] and quaternions, and of the table's height at z = 0 [m].
-SAME: Final = 1e-9
+TABLETOP: Final = "tabletop"  # folder of scenes with a table, and part of the names of their experiments
+SAME: Final = 1e-9  # tolerance of equal positions and of the table's height [m], and of equal quaternions
 #: Folder of a set of objects in a checkout of DexGraspBench.
 SET: Final = Path("assets") / "object" / "graspd"
 SCALE: Final = "scale100"
@@ -47,31 +43,22 @@ def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
     mesh_file(obj, root / folder / "mesh" / "simplified.obj")
     pieces = [hull(corners) for corners in decompose(obj).vertices]
     meshes = root / folder / "urdf" / "meshes"
-    # The evaluator reads every file of this folder as a piece: remove those of an earlier export.
+    # The evaluator reads all files of this folder as pieces, so those of an earlier export are removed.
     for old in meshes.iterdir():
         old.unlink()
     written = [write_obj(meshes / f"convex_piece_{k:03}.obj", *piece) for k, piece in enumerate(pieces)]
     urdf = urdf_of(name, "object", [f"meshes/{file.name}" for file in written])
     (root / folder / "urdf" / "coacd.urdf").write_text(urdf)
-    solid = sum(volume("hull", (), corners, faces) for corners, faces in pieces)
-    (root / folder / "info" / "simplified.json").write_text(json.dumps(_facts(obj, solid), indent=1) + "\n")
+    _, extents = trimesh.bounds.oriented_bounds(obj.hull_vertices)
+    facts: Row = {"gravity_center": obj.centre_of_mass.tolist(), "obb": np.asarray(extents, float).tolist()}
+    mass = sum(volume("hull", (), corners, faces) for corners, faces in pieces)
+    facts |= {"scale": 1.0, "density": 1.0, "mass": mass}
+    (root / folder / "info" / "simplified.json").write_text(json.dumps(facts, indent=1) + "\n")
     save_record(root / scene, _scene(name, f"floating/{SCALE}", IDENTITY_POSE))
     split = root / SET / "valid_split" / "all.json"
     names = json.loads(split.read_text()) if split.is_file() else []
     split.write_text(json.dumps(sorted({*names, name}), indent=1) + "\n")
     return folder, scene
-
-
-def _facts(obj: ObjectModel, solid: float) -> dict[str, Any]:
-    """Return mass, density, bounds and centre of mass; mass is the pieces' volume `solid` at density 1."""
-    _, extents = trimesh.bounds.oriented_bounds(obj.hull_vertices)
-    return {
-        "gravity_center": obj.centre_of_mass.tolist(),
-        "obb": np.asarray(extents, float).tolist(),
-        "scale": 1.0,
-        "density": 1.0,
-        "mass": solid,
-    }
 
 
 def write_table(name: str, pose: Floats, number: int, root: Path) -> Path:
@@ -108,16 +95,15 @@ def check_table(placed: PlacedGrasps) -> None:
     table = placed.supports[0].planes if len(placed.supports) == 1 else np.zeros((0, 4))
     if table.shape != (1, 4) or not np.allclose(table[0], [0, 0, 1, 0], rtol=0, atol=SAME):
         raise InputError(
-            "DexGraspBench's tabletop test has only a floor at z = 0, but the shard has another scene; "
+            "DexGraspBench's tabletop test has only a table with its top at z = 0, but the shard has another scene; "
             "export grasps that were planned with --scene table"
         )
 
 
 def tabletop_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats) -> Row:
-    """Return `approach_qpos` and `lift_qpos` of a grasp whose object is at `pose` (7,)."""
-    assert grasps.approach is not None, "grasps in scenes have their approach"
-    assert grasps.coming is not None
-    assert grasps.lift is not None
+    """Return the fields for hands on arms of a grasp whose object is at `pose` (7,); the evaluator ignores them.
+    `approach_qpos` (W, 7 + J) is the open hand from standoff to pregrasp, `lift_qpos` (7 + J,) the raised squeeze."""
+    assert grasps.approach is not None and grasps.coming is not None and grasps.lift is not None
     way = compose(pose, grasps.approach[row])
     raised = compose(pose, grasps.lift.hand_pose[row])
     return {
@@ -127,7 +113,7 @@ def tabletop_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row
 
 
 def tables_at(obj_pose: Floats) -> PlacedGrasps:
-    """Return a table for each of the object poses (N, 7); equal poses share one. Fingertips may touch it."""
+    """Return scenes with the object at its poses (N, 7) on a table; equal poses share a scene."""
     _, first, index = np.unique(np.round(obj_pose / SAME), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     number = np.empty(len(order), np.intp)
@@ -137,8 +123,8 @@ def tables_at(obj_pose: Floats) -> PlacedGrasps:
 
 def object_of_scene(file: Path, scene_path: str) -> Row:
     """Return `obj_pose` and `obj_scale` of the object in the scene that a grasp's file names.
-    The scene's path is relative to a folder above the file, and lies below `assets` of this folder. Raises InputError:
-    the path leads elsewhere."""
+    The scene's path begins with `assets/`, relative to a folder above the file. Raises InputError: the path is another,
+    or its file is missing or no scene."""
     place = PurePosixPath(scene_path)
     if place.is_absolute() or ".." in place.parts or place.parts[:1] != ("assets",):
         raise InputError(f"{file} names the scene {scene_path!r}; a scene lies below assets/")
@@ -159,7 +145,7 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
 def with_trajectory(
     hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> GraspSet:
-    """Add approach and lift (object frame) if approaches have equally many waypoints and constant joints."""
+    """Add approach and lift (object frame) if all approaches have the same number of waypoints and fixed joints."""
     if not all({"approach_qpos", "lift_qpos"} <= set(row) for row in rows):
         return grasps
     ways = [np.asarray(row["approach_qpos"], float) for row in rows]

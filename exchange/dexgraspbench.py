@@ -1,9 +1,7 @@
 """DexGraspBench's layout: one pickled dictionary per grasp, and the files that its evaluator needs.
 
-Fields: `obj_path`, `obj_scale`, `obj_pose` (7,), and `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + J,) each: root
-position, root quaternion w x y z, joints. Root and object share one world frame. Root and joint order belong to the
-model that a benchmark's configuration names. A mapping file of the experiment relates them to root and joint order of
-graspd. Grasps on a table have more fields, see `bench_scene`."""
+docs/how-to/exchange/dexgraspbench.md describes files and fields. `..._qpos` have root and joint order of the model that
+a benchmark's configuration names; `HandMapping` relates both to graspd's hand."""
 
 from __future__ import annotations
 
@@ -41,31 +39,26 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-#: Prefix of our hands' configurations, and name of the experiment.
-NAME: Final = "graspd"
+NAME: Final = "graspd"  # prefix of the names of configurations and experiments
 
 
 def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
     """Read a file or folder: one set of free grasps, and one of grasps on tables, for each scale.
-    Without a mapping, joints are in the order of `hand`."""
-    # Descriptions of scenes are also pickled dictionaries.
+    Without a mapping, root and joints are those of `hand`. Raises InputError: a file is invalid, or hands differ."""
+    # Scenes are pickled dictionaries as well.
     files = [path] if path.is_file() else [f for f in sorted(path.rglob("*.npy")) if "scene_cfg" not in f.parts]
     if not files:
         raise InputError(f"{path} has no .npy files; DexGraspBench has one for each grasp")
     mappings = {mapping_of(file) for file in files}
     if len(mappings) > 1:
         names = ", ".join(sorted(one.config if one else "another" for one in mappings))
-        raise InputError(f"{path} holds grasps for {len(mappings)} models of a hand ({names}); give the folder of one")
+        raise InputError(f"{path} has grasps for {len(mappings)} models of a hand ({names}); give the folder of one")
     sets: dict[tuple[float, bool], list[Row]] = defaultdict(list)
     for file in files:
         for row in _rows(file):
-            on_table = any(part.startswith(TABLETOP) for part in str(row.get("scene_path", "")).split("/"))
-            sets[_scale(row), on_table].append(row)
+            sets[_scale(row), _is_on_table(row)].append(row)
     model, mapping = hand_from_path(hand), mappings.pop()
-    return [
-        _set(path, model, scaled_object(obj, scale), rows, scale, mapping, on_table=on_table)
-        for (scale, on_table), rows in sorted(sets.items(), key=lambda item: item[0])
-    ]
+    return [_set(path, model, obj, sets[key], mapping) for key in sorted(sets)]
 
 
 def write(
@@ -76,10 +69,9 @@ def write(
     folder: Path,
     placed: PlacedGrasps | None = None,
 ) -> list[Path]:
-    """Write grasps and all files that DexGraspBench's evaluator needs, to be copied over its checkout.
-    The object has scale 1. It is at the origin or, for `placed` grasps, on its table, as in the tabletop test; the two
-    cases are separate experiments. Grasps are written for a model of the hand that is made here, and for the
-    benchmark's own model of the same hand, if any. Return the files of grasps for the first model."""
+    """Write grasps and all files that DexGraspBench's evaluator needs; return the first experiment's grasp files.
+    The object is at the origin or, for `placed` grasps, on its table. Each of `write_models` gets an experiment. Raises
+    InputError: the scenes are no tables."""
     if placed is not None:
         check_table(placed)
     name = plain_name(obj.name)
@@ -124,7 +116,7 @@ def write_models(hand: HandModel, folder: Path) -> list[HandMapping]:
 
 
 def experiment_name(placed: PlacedGrasps | None) -> str:
-    """Return the name of an experiment: free grasps and grasps on tables are separate."""
+    """Return the name of the experiment of free grasps, or of grasps on tables."""
     return NAME if placed is None else f"{NAME}_{TABLETOP}"
 
 
@@ -139,49 +131,45 @@ def qpos_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: in
 
 
 def _rows(file: Path) -> list[Row]:
-    """Return the grasps of a file: one, or several if `..._qpos` have one more axis."""
+    """Return the grasps of a file: one, or K if `..._qpos` are (K, 7 + J)."""
     found = load_npy(file)
     if not isinstance(found, dict):
-        raise InputError(f"{file} holds no dictionary; DexGraspBench has one per file")
+        raise InputError(f"{file} is no dictionary, as DexGraspBench has it")
     if missing := [f"{name}_qpos" for name in POSTURES if f"{name}_qpos" not in found]:
         raise InputError(f"{file} has no {missing[0]}")
     # A file without the object's pose names a scene that has it.
     if "obj_pose" not in found and "scene_path" in found:
         found |= object_of_scene(file, str(found["scene_path"]))
     count = {len(found[f"{name}_qpos"]) if np.ndim(found[f"{name}_qpos"]) == 2 else 0 for name in POSTURES}
-    if count == {0}:
-        return [_scaled(found)]
-    if len(count) > 1 or 0 in count:
-        raise InputError(f"{file}: the numbers of pregrasps, grasps and squeezes differ")
-    return [_scaled({key: _part(value, k, count) for key, value in found.items()}) for k in range(min(count))]
+    rows = [found]
+    if count != {0}:
+        if len(count) > 1:
+            raise InputError(f"{file}: the numbers of pregrasps, grasps and squeezes differ")
+        rows = [{key: _part(value, k, count) for key, value in found.items()} for k in range(min(count))]
+    for row in rows:
+        if "scene_scale" in row:
+            row["obj_scale"] = _scale(row) * float(np.ravel(row["scene_scale"])[0])
+    return rows
 
 
 def _part(value: Any, k: int, count: set[int]) -> Any:
-    """Return the value of grasp k; a value that a file contains once is shared."""
+    """Return grasp k's part of a value (K, ...); all grasps share other values."""
     each = isinstance(value, np.ndarray) and value.ndim > 0 and {len(value)} == count and value.dtype != object
     return value[k] if each else value
-
-
-def _scaled(row: Row) -> Row:
-    if "scene_scale" not in row:
-        return row
-    return row | {"obj_scale": _scale(row) * float(np.ravel(row["scene_scale"])[0])}
 
 
 def _scale(row: Row) -> float:
     return float(np.ravel(row.get("obj_scale", 1.0))[0])
 
 
-def _set(
-    path: Path,
-    hand: HandModel,
-    obj: ObjectModel,
-    rows: list[Row],
-    scale: float,
-    mapping: HandMapping | None,
-    *,
-    on_table: bool,
-) -> ImportedGrasps:
+def _is_on_table(row: Row) -> bool:
+    return any(part.startswith(TABLETOP) for part in str(row.get("scene_path", "")).split("/"))
+
+
+def _set(path: Path, hand: HandModel, obj: str, rows: list[Row], mapping: HandMapping | None) -> ImportedGrasps:
+    """Return grasps of one scale, all of a free object or all on tables."""
+    scale = _scale(rows[0])
+    thing = scaled_object(obj, scale)
     pose = np.array([np.ravel(row.get("obj_pose", IDENTITY_POSE)) for row in rows], float)
 
     def posture(name: str) -> Posture:
@@ -200,8 +188,8 @@ def _set(
     pregrasp, grasp, squeeze = map(posture, POSTURES)
     grasps = GraspSet(grasp, pregrasp, squeeze, np.full(len(rows), np.nan))
     published = np.array([int(bool(row["succ_flag"])) if "succ_flag" in row else -1 for row in rows], np.int8)
-    name = str(rows[0].get("obj_path", obj.name)).rstrip("/").rsplit("/", 1)[-1]
-    placed = tables_at(pose) if on_table else None
+    name = str(rows[0].get("obj_path", thing.name)).rstrip("/").rsplit("/", 1)[-1]
+    placed = tables_at(pose) if _is_on_table(rows[0]) else None
     if placed is not None:
         grasps = replace(with_trajectory(hand, grasps, rows, pose, mapping), scene=placed.index)
-    return ImportedGrasps(hand, obj, grasps, name, scale, published, placed)
+    return ImportedGrasps(hand, thing, grasps, name, scale, published, placed)

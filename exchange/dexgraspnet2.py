@@ -1,36 +1,12 @@
 """DexGraspNet 2.0's folder: scenes as in GraspNet-1Billion, and dexterous grasps for each.
 
-Zhang et al., DexGraspNet 2.0, CoRL 2024. Below `data/`, NNNN is a scene and VVVV is a view of the scene:
-
-    scenes/scene_NNNN/realsense/
-        depth_gt/VVVV.png           16 bits, in steps of 1 / `factor_depth` [m]; 0: no surface
-        label_gt/VVVV.png           0: table and background, 1: the object, 2, ...: neighbours
-        meta/VVVV.mat               `intrinsic_matrix`, `factor_depth`, `cls_indexes`, `poses` (3, 4, 1)
-        camera_poses.npy            (256, 4, 4) camera pose of each view in the camera frame of view 0
-        cam0_wrt_table.npy          (4, 4) camera pose of view 0 in the table's frame
-    dex_grasps_new/scene_NNNN/HAND/OBJECT.npz
-        `translation` (N, 3), `rotation` (N, 3, 3): root link in the camera frame of view 0; `point` (N, 3):
-            surface point of the object that the grasp aims at, in the same frame; each joint (N,) by its name
-    dex_graspness_new/scene_NNNN/realsense/VVVV.npy
-        (P, 1) f4 graspness of the P points that DexGraspNet's loader makes of the view, in pixel order
-
-That loader puts the centre of pixel (u, v) at u, v, but graspd at u + 0.5, v + 0.5. The intrinsics account for this.
-
-Graspness is a distance-weighted number of grasps that aim at a point. Values follow src/preprocess/dex_graspness.py,
-and clouds follow src/utils/pc.py, both of zcyqyq/DexTouch-sim2real at 7824d859a8da1d942bc38709a9d217dfb548db5d. 1,000
-surface points represent an object:
-
-    grasp g aims from the palm at the middle between its thumb and its other fingers
-    seen    points ahead within 30 degrees of that line, at most 20 mm beyond the first of them along the line
-    p_g     the seen point with the least angle / 10 degrees + distance beyond the first / 15 mm
-    value   of a point: sum over all grasps of 10^(-150 d); d is the point's distance from p_g [m]. Values are
-        not normalised; their loader computes the logarithm of value + 0.001
-    pixel   on the object: the value of the nearest point; elsewhere 0
+Zhang et al., DexGraspNet 2.0, CoRL 2024. docs/how-to/exchange/dexgraspnet2.md describes files and graspness, the
+distance-weighted number of grasps that aim at a point. Values follow src/preprocess/dex_graspness.py, and clouds follow
+src/utils/pc.py, both of zcyqyq/DexTouch-sim2real at 7824d859a8da1d942bc38709a9d217dfb548db5d.
 
 Their code uses thumb and middle finger of a LEAP hand, and the centre of its palm's box. This module uses any hand's
-thumb, the mean of its other fingertips, and the palm's surface. If no point is seen, their code stops; here the point
-nearest to the palm counts. For the nearest point their code documents a limit of 15 mm, but compares 0.015 with the
-squared distance of pytorch3d's `knn_points`. This module uses the resulting limit of 122 mm.
+thumb, the mean of its other fingertips, and the palm's surface. Their code stops if a grasp sees no point. Here such a
+grasp aims at the point nearest to the palm.
 
 `service.readers.clouds.graspness` differs: it is the share of grasps whose hand touches a point."""
 
@@ -41,7 +17,6 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -78,21 +53,19 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.annotate import OBJECT
 from graspd.worker.rendering.export import export_png
 
-SAMPLES: Final = 1000
+SAMPLES: Final = 1000  # number of surface points that represent an object
 #: Half the opening of a grasp's view cone [rad], and its depth beyond the first point [m].
 CONE: Final = np.pi / 6
 BAND_M: Final = 0.02
 #: Angle [rad] and distance beyond the first point [m] that each add 1 to the cost of a seen point.
 ANGLE_HALF: Final = np.pi / 18
 HEIGHT_HALF_M: Final = 0.015
-#: Powers of ten by which a grasp's weight falls per metre from its aim point [1/m].
-FALL_PER_M: Final = 150.0
-#: Largest distance of a pixel from the point whose value it takes [m].
+FALL_PER_M: Final = 150.0  # powers of ten by which a grasp's weight falls per metre from its aim point [1/m]
+#: Largest distance of a pixel from the point whose value it takes [m]. Their code documents 15 mm, but compares 0.015
+#: with the squared distance of pytorch3d's `knn_points`.
 REACH_M: Final = 0.015**0.5
-#: Largest distance of the cloud's points from the box around all objects [m].
-OUTLIER_M: Final = 0.02
-#: Number of grasps that are evaluated at once: some 6 MB per array.
-_AT_ONCE: Final = 256
+OUTLIER_M: Final = 0.02  # largest distance of the cloud's points from the box around all objects [m]
+_AT_ONCE: Final = 256  # number of grasps in a block of computation: about 6 MB per array
 
 
 def surface_samples(obj: ObjectModel) -> Floats:
@@ -105,12 +78,9 @@ def surface_samples(obj: ObjectModel) -> Floats:
 class SceneGraspness:
     """Graspness of the object in a scene, from all its grasps in this scene."""
 
-    samples: Floats
-    """(S, 3) points of the object's surface, in its frame [m]."""
-    pointed: NDArray[np.intp]
-    """(K,) index of the point that each grasp aims at."""
-    values: Floats
-    """(S,) graspness of the points, between 0 and K."""
+    samples: Floats  # (S, 3) points of the object's surface, in its frame [m]
+    pointed: NDArray[np.intp]  # (K,) index of the point that each grasp aims at
+    values: Floats  # (S,) graspness of the points, between 0 and K
 
     @classmethod
     def of(cls, hand: HandModel, grasps: Posture, samples: Floats) -> SceneGraspness:
@@ -121,10 +91,9 @@ class SceneGraspness:
     def of_view(
         self, depth: Floats, labels: NDArray[np.uint8], intrinsics: Floats, camera: Floats, object_pose: Floats
     ) -> NDArray[np.float32]:
-        """Return the graspness (N, 1) of the points that the loader makes of a picture; 0 on neighbours.
-        `depth` (H, W) [m] is 0 without a surface. `labels` (H, W) are 0 for background and 1 for the object of the
-        grasps; at least one label is not 0. `intrinsics` are (3, 3) [px]. `camera` (4, 4) and `object_pose` (7,) are in
-        the table's frame. Points are in pixel order."""
+        """Return the graspness (N, 1) of a picture's points, as the loader makes and orders them; 0 on neighbours.
+        `depth` (H, W) [m] is 0 without a surface. `labels` (H, W) are 0 for background and 1 for the grasps' object; at
+        least one is not 0. `intrinsics` are (3, 3) [px]. `camera` (4, 4) and `object_pose` (7,): table's frame."""
         cloud = back_project(depth, intrinsics)
         inside = workspace_mask(cloud, depth, labels, camera)
         found = np.zeros(np.count_nonzero(inside), np.float32)
@@ -137,9 +106,9 @@ class SceneGraspness:
 
 
 def lines_of_sight(hand: HandModel, grasps: Posture) -> tuple[Floats, Floats]:
-    """Return origins (K, 3) and unit directions (K, 3) of K grasps' lines of sight, in their frame [m].
-    The thumb is the fingertip that is on average farthest from the other fingertips before the hand closes. For hands
-    with one fingertip, or with fingers that meet in the palm, the line is the approach."""
+    """Return origins (K, 3) [m] and unit directions (K, 3) of the lines from palm to middle of thumb and fingers.
+    The thumb is the fingertip farthest from the other fingertips of the open hand. With one fingertip, or fingers that
+    meet in the palm, the line is the approach."""
     palm = apply(grasps.hand_pose, hand.palm.centre)
     line = quat_rotate(grasps.hand_pose[:, 3:], hand.palm.approach)
     if len(hand.fingertips) < 2:
@@ -192,9 +161,8 @@ def back_project(depth: Floats, intrinsics: Floats) -> Floats:
 
 
 def workspace_mask(cloud: Floats, depth: Floats, labels: NDArray[np.uint8], camera: Floats) -> NDArray[np.bool_]:
-    """Return a mask (H, W) of pixels whose points (H, W, 3) the loader keeps.
-    Such pixels have a depth, and their points are near the box around all labelled points, in the table's frame. As in
-    the loader, labelled pixels without depth extend the box to the camera."""
+    """Return a mask (H, W) of pixels whose points (H, W, 3) the loader keeps: near the box around labelled points.
+    The box is in the table's frame. As in the loader, labelled pixels without depth extend it to the camera."""
     whole = np.concatenate([cloud.reshape(-1, 3), np.ones((depth.size, 1))], axis=1)
     there = np.einsum("ab,nb->na", camera, whole)[:, :3]
     objects = there[labels.reshape(-1) > 0]
@@ -203,31 +171,29 @@ def workspace_mask(cloud: Floats, depth: Floats, labels: NDArray[np.uint8], came
     return np.asarray(inside.reshape(depth.shape) & (depth > 0))
 
 
+Noise = DepthNoise | None
 CAMERA: Final = "realsense"
-#: Number of views of each scene; the loader samples among them.
-VIEWS: Final = 256
-#: Steps per metre in a depth picture: 16 bits reach 6.5 m.
-FACTOR: Final = 10000
-#: Numbers of scenes: `train_1` and `part` are for training, `val` and `test` for held-out objects.
+VIEWS: Final = 256  # number of views of each scene; the loader samples among them
+FACTOR: Final = 10000  # steps per metre in a depth picture: 16 bits reach 6.5 m
+#: Numbers of scenes for training (`train_1`, `part`), and for held-out objects (`val`, `test`).
 TRAIN: Final = (range(90), range(1000, 8500))
 HELD_OUT: Final = (range(90, 100), range(100, 190))
-#: Keys of a file of grasps that do not name joints.
+#: Keys of a file of grasps that are no joints: those of the loader, and further ones of graspd.
 _PLACE: Final = ("translation", "rotation", "point")
 _OURS: Final = ("pregrasp_qpos", "squeeze_qpos", "success", "row")
-#: Argument names of NumPy's writer.
+#: Argument names of `numpy.savez_compressed`, which no array may have.
 _NUMPYS: Final = ("file", "args", "kwds", "allow_pickle")
-#: Largest size of a `meta` file [bytes]; real ones have 2 kB. Unpacked, a file is at most 1,000 times as large.
+#: Largest size of a `meta` file [bytes]; real ones have 2 kB. Compression is at most 1,000-fold.
 _LARGEST_META: Final = 64 * 2**10
 #: Largest unpacked size of an `.npz` file [bytes]; the grasps of one object are far smaller.
 LARGEST: Final = 2**30
-#: Largest number of arrays in an `.npz` file.
-_MEMBERS: Final = 1024
+_MEMBERS: Final = 1024  # largest number of arrays in an `.npz` file
 
 
 def write(
-    lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
+    lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: Noise = None
 ) -> ExportSummary:
-    """Write each scene that has pictures and grasps; grasps are planned in it or transferred to it."""
+    """Write each scene with pictures and grasps. Raises InputError: there is none, or too many for the format."""
     top = folder / "data"
     if top.exists():
         raise InputError(f"{top} exists already; give another folder as --output")
@@ -241,7 +207,8 @@ def write(
             )
         raise InputError("no picture shows a scene with grasps; render views into the grasps' folder: graspd render")
     done = ExportSummary({"grasps": 0, "scenes": len(scenes), "views": 0, "files": len(scenes)})
-    numbers = {held: _numbers(held, scenes, known, out) for held in (False, True)}
+    held_out = sum(known[some[0].base].name in out for some in scenes)
+    numbers = {False: _scene_numbers(len(scenes) - held_out, TRAIN), True: _scene_numbers(held_out, HELD_OUT)}
     samples: dict[str, Floats] = {}
     for some in scenes:
         lot = known[some[0].base]
@@ -258,24 +225,16 @@ def write(
     return done
 
 
-def _numbers(
-    held: bool, scenes: list[list[PictureReference]], known: dict[str, ExportPart], out: frozenset[str]
-) -> Iterator[int]:
-    count = sum((known[some[0].base].name in out) is held for some in scenes)
-    room = [number for numbers in (HELD_OUT if held else TRAIN) for number in numbers]
-    if count > len(room):
-        what = "held-out objects" if held else "objects to train on"
-        raise InputError(f"there are {count} scenes of {what}, but DexGraspNet 2.0 has numbers for {len(room)}")
-    return islice(room, count)
+def _scene_numbers(count: int, ranges: Sequence[range]) -> Iterator[int]:
+    numbers = [number for some in ranges for number in some]
+    if count > len(numbers):
+        what = "held-out objects" if ranges is HELD_OUT else "objects to train on"
+        raise InputError(f"there are {count} scenes of {what}, but DexGraspNet 2.0 has numbers for {len(numbers)}")
+    return iter(numbers)
 
 
 def _write_scene(
-    some: list[PictureReference],
-    pictures: Pictures,
-    top: Path,
-    name: str,
-    noise: DepthNoise | None,
-    graspness: SceneGraspness,
+    some: list[PictureReference], pictures: Pictures, top: Path, name: str, noise: Noise, graspness: SceneGraspness
 ) -> None:
     path, values = top / "scenes" / name / CAMERA, top / "dex_graspness_new" / name / CAMERA
     kinds = ((path / "depth_gt", "png"), (path / "label_gt", "png"), (path / "meta", "mat"), (values, "npy"))
@@ -292,6 +251,7 @@ def _write_scene(
         export_png(path / "depth_gt" / f"{view:04}.png", steps.astype(np.uint16))
         labels = np.maximum(np.asarray(sample["image/segmentation"], int) - (OBJECT - 1), 0).astype(np.uint8)
         export_png(path / "label_gt" / f"{view:04}.png", labels)
+        # Pixel (u, v) has its centre at u, v in the loader, but at u + 0.5, v + 0.5 in graspd.
         intrinsics = np.asarray(sample["camera/intrinsics"], float) - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
         pose = np.asarray(sample["object/pose"])
         meta = {
@@ -335,7 +295,7 @@ def _write_grasps(look: PictureReference, lot: ExportPart, folder: Path, graspne
     point = apply(in_camera, graspness.samples[graspness.pointed])
     arrays: dict[str, Any] = {"translation": matrices[:, :3, 3], "rotation": matrices[:, :3, :3], "point": point}
     arrays |= {name: some["grasp"].joint_positions[:, k] for k, name in enumerate(names)}
-    # The loader ignores these arrays; they are needed to import the grasps unchanged.
+    # The loader ignores these arrays; the importer needs them.
     for name in ("pregrasp", "squeeze"):
         arrays[f"{name}_qpos"] = np.concatenate([placed[name], some[name].joint_positions], axis=1)
     arrays |= {"success": lot.verdict[look.rows], "row": look.rows}
@@ -345,7 +305,7 @@ def _write_grasps(look: PictureReference, lot: ExportPart, folder: Path, graspne
 
 def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
     """Read grasps of `data/dex_grasps_new/SCENE/HAND/OBJECT.npz`, in the object's frame.
-    The scene's `meta` has the object's pose; `number` is the index of the object in the scene, from 0."""
+    `number` is the index, from 0, of the object in the scene, whose `meta` has the object's pose."""
     found = load_npz(path)
     try:
         count = len(found["translation"])
@@ -363,19 +323,18 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGr
     except ValueError as error:
         raise InputError(f"{path} needs one value of each joint for each of {count} grasps: {error}") from None
     grasp = Posture(compose(away, pose_from_matrix(matrices)), joints_by_name(model, names, values, what=str(path)))
-    grasps = _add_own_columns(path, model, found, grasp, away)
-    if grasps is None:
-        grasps = add_postures(model, thing, grasp)
+    grasps = _add_postures(path, model, thing, found, grasp, away)
     success = found.get("success")
     published = None if success is None or np.size(success) != count else parse_verdicts(success)
     return [ImportedGrasps(model, thing, grasps, path.stem, published=published)]
 
 
-def _add_own_columns(
-    path: Path, hand: HandModel, found: dict[str, NDArray[Any]], grasp: Posture, away: Floats
-) -> GraspSet | None:
+def _add_postures(
+    path: Path, hand: HandModel, obj: ObjectModel, found: dict[str, NDArray[Any]], grasp: Posture, away: Floats
+) -> GraspSet:
+    """Return grasps with pregrasp and squeeze from a file of graspd, or as graspd computes them."""
     if not {"pregrasp_qpos", "squeeze_qpos"} <= set(found):
-        return None
+        return add_postures(hand, obj, grasp)
     parts = []
     for name in ("pregrasp_qpos", "squeeze_qpos"):
         qpos = np.asarray(found[name], float)
@@ -386,7 +345,7 @@ def _add_own_columns(
 
 
 def _object_pose(path: Path, number: int) -> Floats:
-    """Return the object's pose (7,) in the camera of view 0, the frame of the grasps."""
+    """Return the object's pose (7,) in the camera frame of view 0, the frame of the grasps."""
     try:
         scene, data = path.resolve().parents[1].name, path.resolve().parents[3]
     except IndexError:

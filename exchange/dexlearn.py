@@ -1,14 +1,8 @@
 """DexLearn's folder: files with several grasps each, splits, scenes, and partial point clouds.
 
-Copy the folder over a checkout of DexLearn (Chen et al., baselines of BODex and Dexonomy). Files in `assets/`:
-
-    grasp/NAME/succ_collect/TYPE/OBJECT/.../*.npy   `..._qpos` (K, 7 + J), `scene_path`, `scene_scale` (K,)
-    object/graspd/valid_split/{train,test}.json     names of objects
-    object/graspd/scene_cfg/OBJECT/...              as DexGraspBench has them, with a `scene_id`
-    object/graspd/vision_data/azure_kinect_dk/SCENE_ID/partial_pc_NN.npy    (P, 3) points [m]
-
-Root poses and points share one frame: the table's or, for grasps of a free object, the object's. Roots and joints are
-those of a hand model that DexGraspBench evaluates, see `bench_hand`."""
+DexLearn (Chen et al.) has the networks of BODex and Dexonomy. docs/how-to/exchange/dexlearn.md describes files. Root
+poses and points share one frame: the table's or, for free grasps, the object's. Roots and joints are those of a hand
+model of DexGraspBench, see `bench_hand`."""
 
 from __future__ import annotations
 
@@ -34,7 +28,7 @@ from graspd.worker.grasps import GraspSet
 #: Folder of each `quality/grasp_type`; the number before the underscore is a network's input.
 TYPES: Final = ("0_any", "1_power", "2_precision", "3_lateral")
 VISION: Final = SET / "vision_data" / "azure_kinect_dk"
-#: Number of points in a network's input; they are sampled from a cloud with repetition.
+#: Number of points in a network's input; the loader samples them from a cloud with repetition.
 POINTS: Final = 1024
 _FREE: Final = -1
 
@@ -69,7 +63,7 @@ def write(
     return done
 
 
-#: Scene file below the folder, by shard and scene; free grasps have the scene file of their object.
+#: Scene file below the folder, by shard and scene; `_FREE` stands for free grasps, which have one file per object.
 _Scenes = dict[tuple[str, int], Path]
 #: Grasps of one shard that share scene file and grasp type.
 _Part = tuple[ExportPart, Path, int, NDArray[np.intp]]
@@ -95,7 +89,7 @@ def _scenes(lots: Sequence[ExportPart], folder: Path) -> _Scenes:
 def _clouds(
     pictures: Pictures, lots: Sequence[ExportPart], scenes: _Scenes, folder: Path, noise: DepthNoise | None
 ) -> tuple[int, int]:
-    """Write the object's cloud of each picture; return the numbers of clouds and of scenes without one."""
+    """Write the object's cloud of each picture; return the numbers of clouds and of scenes without cloud."""
     on_table = {lot.id: lot.placed is not None for lot in lots}
     written = Counter[Path]()
     for look in pictures_without_pixels(pictures):
@@ -108,13 +102,13 @@ def _clouds(
         written[scene] += 1
     bare = set(scenes.values()) - set(written)
     for scene in bare if written else ():
-        # DexLearn's test needs a cloud of every scene in the folder.
+        # DexLearn's test fails for a scene in the folder without a cloud.
         (folder / scene).unlink()
     return written.total(), len(bare)
 
 
 def points_of(pictures: Pictures, look: PictureReference, noise: DepthNoise | None, *, on_table: bool) -> Floats:
-    """Return the object's points (P, 3) in a picture [m]; frame of the table, if any, or of the object."""
+    """Return the object's points (P, 3) in a picture [m], in the frame of the table or of the free object."""
     view = CloudView(pictures[look.index], noise, np.random.default_rng(look.index))
     points = view.points(*view.pixels(whole=False))
     return points if on_table else apply(invert(look.object_pose), points)
@@ -126,7 +120,7 @@ def _write_group(
     parts = [(lot, *part) for lot in lots for part in _rows_of(lot, scenes, folder, seen=seen)]
     listed = sorted({kind for _, _, kind, _ in parts if _in_both(kind, parts, out)})
     if not listed:
-        # No type has objects in both splits, so all grasps get one type.
+        # Without a type that has objects in both splits, all grasps get one type.
         parts, listed = [(lot, scene, 0, rows) for lot, scene, rows in _untyped(parts)], [0]
     done.counts["grasps"] += sum(len(rows) for *_, rows in parts)
     for mapping in write_models(lots[0].hand, folder):
@@ -143,7 +137,7 @@ def _write_group(
 def _rows_of(
     lot: ExportPart, scenes: _Scenes, folder: Path, *, seen: bool
 ) -> Iterator[tuple[Path, int, NDArray[np.intp]]]:
-    """Yield the lot's rows by scene file and type; with `seen`, skip scenes without a cloud."""
+    """Yield scene file, type, and rows of the part; with `seen`, skip scenes without a cloud."""
     index = np.full(len(lot.grasps), _FREE) if lot.placed is None else np.asarray(lot.placed.index)
     types = np.asarray(lot.shard.arrays.get("quality/grasp_type", np.zeros(len(index))), np.intp)
     for scene in sorted({int(index[row]) for row in lot.rows}):
@@ -156,7 +150,7 @@ def _rows_of(
 
 
 def _in_both(kind: int, parts: Sequence[_Part], out: frozenset[str]) -> bool:
-    """Check whether a type has objects in both splits: DexLearn fails for a type without objects."""
+    """Check whether a type has objects in both splits, as DexLearn needs it."""
     names = {lot.name for lot, _, other, _ in parts if other == kind}
     return not out or bool(names & out and names - out)
 
@@ -175,7 +169,7 @@ def _record(mapping: HandMapping, lot: ExportPart, rows: NDArray[np.intp], scene
     poses = [None if lot.placed is None else np.asarray(lot.placed.object_pose[lot.placed.index[row]]) for row in rows]
     each = [qpos_fields(mapping, lot.hand, grasps, int(row), pose) for row, pose in zip(rows, poses, strict=True)]
     record |= {f"{name}_qpos": np.array([one[f"{name}_qpos"] for one in each]) for name in POSTURES}
-    # DexLearn ignores this pose; it is needed to import the grasps unchanged.
+    # DexLearn ignores the pose; the importer needs it.
     record["obj_pose"] = np.array([IDENTITY_POSE if pose is None else pose for pose in poses])
     return record | {"succ_flag": lot.verdict[rows], "row": np.asarray(rows)}
 

@@ -1,16 +1,8 @@
 """GraspGen's data: a JSON record per object in tar files, with an index, object lists and meshes.
 
-Murali et al., GraspGen, ICRA 2026. Files:
-
-    grasps/GRIPPER/shard_000.tar         members UUID.grasps.json; uuid_index.json: {UUID: number of the shard}
-    splits/GRIPPER/{train,valid}.txt     a UUID per line
-    objects/UUID.obj                     and map_uuid_to_path.json: {UUID: file}
-    grippers/GRIPPER.yaml                width, depth, and GraspGen's frame: z along the approach, x across the jaws
-
-A record has `object` {file, scale} and `grasps` {`transforms` (N, 4, 4), `object_in_gripper` (N,) true or false}. A
-transform is the pose of the gripper's base link in the object's frame, with the mesh multiplied by `scale`. GraspGen's
-readers ignore our other fields: `joint_names`, and root and joints of pregrasp, grasp and squeeze. These fields restore
-grasps of multi-fingered hands."""
+Murali et al., GraspGen, ICRA 2026. docs/how-to/exchange/graspgen.md describes files and fields. `transforms` are poses
+of the gripper's base link in the frame of the object, whose mesh is multiplied by `scale`. Further fields, which
+GraspGen ignores, restore grasps of multi-fingered hands."""
 
 from __future__ import annotations
 
@@ -44,20 +36,15 @@ from graspd.worker.simulation.data import HandState
 MEMBER: Final = "grasps.json"
 INDEX: Final = "uuid_index.json"
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-#: Number of objects in a tar file.
-PER_SHARD: Final = 64
-#: Largest size of a record that is read [bytes]; 2,000 grasps have half a megabyte.
-LARGEST: Final = 256 * 2**20
-#: GraspGen's generator skips objects with fewer good grasps than this.
-FEWEST: Final = 5
-#: Tolerance of a published rotation matrix, since matrices are printed with six digits or more.
-_ROTATION: Final = 1e-3
-#: Number of hands that are closed at once.
-_AT_ONCE: Final = 256
+PER_SHARD: Final = 64  # number of objects in a tar file
+LARGEST: Final = 256 * 2**20  # largest size of a record [bytes]; 2,000 grasps have half a megabyte
+FEWEST: Final = 5  # number of good grasps below which GraspGen's generator skips an object
+_ROTATION: Final = 1e-3  # tolerance of rotation matrices, which files have with six digits or more
+_AT_ONCE: Final = 256  # number of hands in a batch of closing
 
 
 def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write all validated grasps of each hand, including failed ones; `valid.txt` lists held-out objects."""
+    """Write all validated grasps, failed ones included, in a folder per hand; `valid.txt` has held-out objects."""
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds grasps already; give another folder as --output")
     done = ExportSummary({"grasps": 0, "good": 0, "objects": 0, "files": 0})
@@ -106,9 +93,7 @@ def _write_hand(hand: HandModel, lots: list[ExportPart], folder: Path, out: set[
     done.counts["grasps"] += sum(len(record["grasps"]["transforms"]) for record in records.values())
     done.counts["good"] += sum(good.values())
     if few := sorted(uuid for uuid, count in good.items() if count < FEWEST):
-        done.notes.append(
-            f"GraspGen's generator leaves out objects with fewer than {FEWEST} good grasps, such as {few[0]}"
-        )
+        done.notes.append(f"GraspGen's generator omits objects with fewer than {FEWEST} good grasps, such as {few[0]}")
 
 
 def _record(hand: HandModel, lots: list[ExportPart]) -> dict[str, Any]:
@@ -127,9 +112,9 @@ def _record(hand: HandModel, lots: list[ExportPart]) -> dict[str, Any]:
 
 
 def gripper_convention(hand: HandModel) -> dict[str, Any]:
-    """Return values of a gripper's YAML file: opening [m], reach along the approach [m], and frame.
-    GraspGen's frame is given by its pose [[x, y, z], [x, y, z, w]] in the base link's frame. For a hand
-    without jaws, x is the direction across the approach with the largest distance of open fingertips."""
+    """Return opening [m], reach along the approach [m], and GraspGen's frame, for a gripper's YAML file.
+    The frame is a pose [[x, y, z], [x, y, z, w]] in the base link's frame, with z along the approach and x across the
+    jaws. Without jaws, x is the direction across the approach in which open fingertips are farthest apart."""
     z, jaws = hand.palm.approach, jaws_of(hand)
     if jaws is not None:
         widest = int(np.argmax(jaws.width))
@@ -155,7 +140,8 @@ def gripper_convention(hand: HandModel) -> dict[str, Any]:
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read a record, a tar of records, or a folder of tars; without joints, fingers close until contact."""
+    """Read an object's record from a JSON file, a tar or a folder of tars.
+    Fingers of a record without joints close until contact. Raises InputError: the record is missing or invalid."""
     file, record = _found(path, object_name)
     try:
         scale, grasps = float(record["object"]["scale"]), record["grasps"]
@@ -203,7 +189,7 @@ def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
     found: tuple[str, dict[str, Any]] | None = None
     for file in files:
         try:
-            # Only an uncompressed file is opened: none of its members is larger than the file.
+            # `r:` opens only uncompressed files, whose members cannot be larger than the file.
             with tarfile.open(file, "r:") as tar:
                 for member in tar:
                     key, _, what = Path(member.name).name.partition(".")
@@ -246,6 +232,6 @@ def close_hands_at(hand: HandModel, obj: ObjectModel, hand_pose: NDArray[np.floa
         pose = hand_pose[first : first + _AT_ONCE]
         palm = apply(pose, hand.palm.centre) - obj.centre_of_mass
         state = HandState(palm, pose[:, 3:], np.tile(hand.preshape, (len(pose), 1)))
-        closed = HandCloser(pair, len(pose)).close(state).state
+        closed = HandCloser(pair, len(pose)).close(state)
         joints[first : first + len(pose)] = posture_of(hand, obj, closed).joint_positions
     return Posture(hand_pose, joints)

@@ -1,9 +1,5 @@
 """A folder for `datasets.load_dataset`: a table of grasps, and one of pictures with their grasps.
 
-    grasps/{train,test}-00000.parquet     one grasp per row: postures in the object's frame, verdict, quality
-    pictures/{train,test}-00000.parquet   one picture per row: colour, depth, labels, camera, grasps in its frame
-    README.md                             description of the files
-
 `GRASPS` and `PICTURES` list the columns; docs/how-to/exchange/huggingface.md describes them with units and frames."""
 
 from __future__ import annotations
@@ -72,20 +68,19 @@ PICTURES: Final = {
     "hand_poses": "float64[7][]",
     "joint_positions": "float64[][]",
 }
-#: Number of pictures in a row group.
-_PICTURES_AT_ONCE: Final = 50
+_PICTURES_AT_ONCE: Final = 50  # number of pictures in a row group
 
 
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
 ) -> ExportSummary:
-    """Write both tables, each with splits `train` and `test`; held-out objects are in `test`."""
+    """Write both tables, each with splits `train` and `test`; held-out objects are in `test`.
+    Raises InputError: `folder` has such tables already, or pyarrow is missing."""
     parquet.arrow()
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds a table of grasps already; give another folder as --output")
     done = ExportSummary({"grasps": 0, "pictures": 0, "files": 0})
     sides = {"train": {lot.name for lot in lots} - out, "test": set(out)}
-    names = {lot.id: lot.name for lot in lots}
     for split, some in sides.items():
         if not some:
             done.notes.append("only one object: all grasps are in train, and there is no test split")
@@ -96,8 +91,7 @@ def write(
         done.counts["files"] += 1
         if len(pictures):
             file = folder / "pictures" / f"{split}-00000.parquet"
-            shown = {shard: name for shard, name in names.items() if name in some}
-            groups = _groups(pictures, shown, noise)
+            groups = _groups(pictures, {lot.id: lot.name for lot in mine}, noise)
             done.counts["pictures"] += parquet.write(file, parquet.schema_of(PICTURES), groups)
             done.counts["files"] += 1
     splits = [split for split, some in sides.items() if some]
@@ -109,7 +103,7 @@ def write(
         }
         for table in (["grasps", "pictures"] if len(pictures) else ["grasps"])
     ]
-    # The head of a data set's card, as JSON, which is valid YAML.
+    # The YAML head of the card is JSON, which is valid YAML.
     (folder / "README.md").write_text(
         f"---\nconfigs: {json.dumps(tables)}\n---\n\n# Grasps made with graspd\n\n"
         "Columns, units and frames: docs/how-to/exchange/huggingface.md of graspd.\n"
@@ -186,14 +180,15 @@ def _picture(sample: Mapping[str, Any], name: str, depth: Floats) -> dict[str, A
 
 
 def png(pixels: NDArray[Any]) -> dict[str, Any]:
-    """Return a picture as a PNG file, in the form that Hugging Face's readers expect."""
+    """Return a picture (H, W) or (H, W, 3) as a PNG file, in the form that Hugging Face's readers expect."""
     data = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(data, format="PNG", compress_level=1)
     return {"bytes": data.getvalue(), "path": None}
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read a file, or `grasps/*.parquet` of a folder; free grasps and grasps on tables are separate sets."""
+    """Read a file, or `grasps/*.parquet` of a folder; free grasps and grasps on tables are separate sets.
+    Raises InputError: columns are missing or invalid, or `object_name` selects no single object."""
     files = [path] if path.is_file() else sorted((path / "grasps").glob("*.parquet"))
     columns: dict[str, list[Any]] = {}
     for file in files:
@@ -215,10 +210,8 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
         raise InputError(
             f"{path} has grasps for scenes of the kind {sorted(other)[0]!r}; only table and free are supported"
         )
-    apart = {kind: [k for k in rows if kinds[k] == kind] for kind in (FREE, TABLE)}
-    return [
-        _set(path, hand, obj, wanted, columns, some, on_table=kind == TABLE) for kind, some in apart.items() if some
-    ]
+    sets = {kind: [k for k in rows if kinds[k] == kind] for kind in (FREE, TABLE)}
+    return [_set(path, hand, obj, wanted, columns, some, on_table=kind == TABLE) for kind, some in sets.items() if some]
 
 
 def _set(

@@ -1,7 +1,6 @@
 """Imported grasps before validation: scaled objects, and safe reading of NumPy pickles.
 
-A pickle may call any function while it is loaded. Only arrays, numbers, strings and their containers are allowed here.
-"""
+A pickle can call any function while it is loaded; this module allows only arrays, numbers, strings and containers."""
 
 from __future__ import annotations
 
@@ -30,8 +29,7 @@ class Origin:
     """Source of grasps, and their licence."""
 
     format: str
-    source: str
-    """Reference: an address or a citation."""
+    source: str  # reference: an address or a citation
     licence: str
 
 
@@ -42,11 +40,9 @@ class ImportedGrasps:
     hand: HandModel
     obj: ObjectModel
     grasps: GraspSet
-    name: str
-    """Name of the object in the source, and scale factor of its mesh there."""
-    scale: float = 1.0
-    published: NDArray[np.int8] | None = None
-    """(N,) published success: 1 held, 0 failed, -1 unknown."""
+    name: str  # name of the object in the source
+    scale: float = 1.0  # scale factor of the object's mesh
+    published: NDArray[np.int8] | None = None  # (N,) published success: 1 held, 0 failed, -1 unknown
     placed: PlacedGrasps | None = None
 
 
@@ -61,14 +57,13 @@ def parse_verdicts(values: Sequence[Any] | NDArray[Any]) -> NDArray[np.int8]:
 
 
 def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: str) -> Floats:
-    """Return (N, J) joints of the hand from (N, n) values of `names`; other joints are at mid-range."""
+    """Return (N, J) joints of the hand from (N, n) values of `names`; other joints are at mid-range.
+    Raises InputError, beginning with `what`: the numbers differ, or the hand has no such joint."""
     given = np.atleast_2d(np.asarray(values, float))
     if given.shape[1] != len(names):
         raise InputError(f"{what}: {given.shape[1]} joint values for {len(names)} joints")
     if unknown := [name for name in names if name not in hand.joint_names]:
-        raise InputError(
-            f"{what}: {hand.name} has no joint {unknown[0]!r}; its joints are {', '.join(hand.joint_names)}"
-        )
+        raise InputError(f"{what}: {hand.name} has no joint {unknown[0]!r}; it has {', '.join(hand.joint_names)}")
     order = [hand.joint_names.index(name) for name in names]
     middle = hand.expand(0.5 * (hand.lower + hand.upper)[None])[0]
     out = np.tile(middle, (len(given), 1))
@@ -77,7 +72,7 @@ def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: 
 
 
 def scaled_object(path: str | Path, scale: float = 1.0) -> ObjectModel:
-    """Load a mesh or built-in object, scaled. Unless `scale` is 1, the unit is metres and not guessed."""
+    """Load a mesh or built-in object, scaled. Unless `scale` is 1, the mesh must be in metres."""
     if scale == 1.0:
         return object_from_path(path)
     plain = object_from_path(path, options={"units": "m"})
@@ -86,7 +81,7 @@ def scaled_object(path: str | Path, scale: float = 1.0) -> ObjectModel:
 
 
 def mesh_file(obj: ObjectModel, path: Path) -> Path:
-    """Write the object's prepared mesh as an OBJ file, for readers that support no other format."""
+    """Write the object's prepared mesh as an OBJ file, which all readers support."""
     return write_obj(path, obj.vertices, obj.faces, f"{obj.name}, metres")
 
 
@@ -128,7 +123,7 @@ class _Reader(pickle.Unpickler):
 
 
 def load_npy(path: Path) -> Any:
-    """Load a `.npy` file: an array, or the one object in it; InputError if it would run code."""
+    """Load a `.npy` file: an array, or its only object. Raises InputError: it is invalid, or would run code."""
     try:
         with path.open("rb") as file:
             try:
@@ -136,7 +131,7 @@ def load_npy(path: Path) -> Any:
             except ValueError as error:
                 if "Object arrays" not in str(error):
                     raise
-            # NumPy has read the header: the pickle follows.
+            # The stream is now after the header, at the pickle.
             found = _Reader(file).load()
     except pickle.UnpicklingError as error:
         raise InputError(f"{path} cannot be read safely: {error}") from None

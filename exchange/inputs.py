@@ -30,19 +30,15 @@ class Case:
     hand: HandModel
     obj: ObjectModel
     grasps: GraspSet
-    friction: float | None = None
-    """Coulomb coefficient of the file's metrics."""
-    seconds: float | None = None
-    """Time to make the grasps, if known [s]."""
-    validated: bool = False
-    """Whether `seconds` includes validation."""
-    published: NDArray[np.int8] | None = None
-    """(N,) published success: 1 held, 0 failed, -1 unknown."""
+    friction: float | None = None  # coulomb coefficient of the file's metrics
+    seconds: float | None = None  # time to make the grasps, if known [s]
+    validated: bool = False  # whether `seconds` includes validation
+    published: NDArray[np.int8] | None = None  # (N,) published success: 1 held, 0 failed, -1 unknown
     placed: PlacedGrasps | None = None
 
     @property
     def centred(self) -> Case:
-        """The case relative to the object's centre, so that measurements do not depend on the mesh's origin."""
+        """The case in a frame at the object's centre, so that results do not depend on the mesh's origin."""
         return replace(
             self,
             obj=self.obj.centred,
@@ -52,7 +48,8 @@ class Case:
 
 
 def expand_path(path: Path) -> list[Path]:
-    """Return a path itself, or the base shards and reference grasps of a folder without `.npy` files."""
+    """Return a path itself, or the base shards and reference grasps of a folder without `.npy` files.
+    Raises InputError: the folder has no grasps."""
     if not path.is_dir() or any(path.rglob("*.npy")):
         return [path]
     shards = (file for file in path.rglob("*.h5") if not _is_scene_file(file))
@@ -70,7 +67,8 @@ def _is_scene_file(path: Path) -> bool:
 
 def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) -> Case:
     """Read a base shard (HDF5), a reference-grasps JSON, or a folder with DexGraspBench `.npy` files.
-    `hand` (URDF or built-in) and `obj` (mesh or built-in) override hand and object of the file."""
+    `hand` (URDF or built-in) and `obj` (mesh or built-in) replace hand and object of the file. Raises NotFoundError:
+    the path does not exist; InputError: the file is invalid or of another hand."""
     if path.is_dir():
         return _bench_folder(path, hand, obj)
     if not path.is_file():
@@ -107,6 +105,6 @@ def _bench_folder(path: Path, hand: str | None, obj: str | None) -> Case:
     sets = dexgraspbench.read(path, hand=hand, obj=obj)
     if len(sets) > 1:
         kinds = ", ".join(f"scale {one.scale:g}{' on a table' if one.placed else ''}" for one in sets)
-        raise InputError(f"{path} holds {len(sets)} kinds of grasps ({kinds}); give the folder of one")
+        raise InputError(f"{path} has {len(sets)} kinds of grasps ({kinds}); give the folder of one")
     found = sets[0]
     return Case(path.name, found.hand, found.obj, found.grasps, published=found.published, placed=found.placed)

@@ -1,15 +1,7 @@
 """A LeRobot data set (v3.0): a grasp's trajectory as an episode, with a picture before the motion.
 
-    meta/info.json, meta/stats.json                       features and counts; statistics of each feature
-    meta/tasks.parquet, meta/episodes/chunk-000/...       texts of the tasks; position of each episode's frames
-    data/chunk-CCC/file-FFF.parquet                       frames, with pictures as PNG
-
-A frame is a waypoint of the trajectory, from the standoff to the squeeze. `observation.state` is the present posture;
-`action` is the next posture; in the last frame it is the lift. A posture has the root's position [m] and quaternion w
-x y z in the table's frame, then all moving joints [rad or m]. `observation.environment_state` is the object's rest pose
-in the same frame. Waypoints have no times: `timestamp` is the frame's number over `fps`.
-
-The importer `lerobot` reads only data sets that graspd exported; it returns postures in the object's frame."""
+docs/how-to/exchange/lerobot.md describes the features. A frame is a waypoint of the trajectory, from the standoff to
+the squeeze; `action` is the next frame's state, at the end the lift. The importer reads only exports of graspd."""
 
 from __future__ import annotations
 
@@ -39,8 +31,7 @@ FPS: Final = 10
 STATE, ACTION = "observation.state", "action"
 OBJECT, PICTURE = "observation.environment_state", "observation.images.scene"
 EPISODE: Final = "episode_index"
-#: Column of verdicts in the list of episodes.
-VERDICT: Final = "graspd/verdict"
+VERDICT: Final = "graspd/verdict"  # column of verdicts in the list of episodes
 #: Times and indices that LeRobot stores for each frame.
 NUMBERS: Final = {
     "timestamp": "float32",
@@ -66,7 +57,8 @@ _INDEXED: Final = {
 
 
 def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write an episode per grasp, with a picture of its scene (round-robin); held-out objects come last."""
+    """Write an episode per grasp, with a picture of its scene (round-robin); held-out objects come last.
+    Raises InputError: no picture shows a grasp planned in a scene, or hands or picture sizes differ."""
     parquet.arrow()
     if (folder / "meta").exists():
         raise InputError(f"{folder} holds a data set already; give another folder as --output")
@@ -110,6 +102,8 @@ def postures_of(lot: ExportPart, row: int) -> Floats:
 
 
 class _Writer:
+    """Writer of episodes in sequence, and then of the files in `meta`."""
+
     def __init__(self, folder: Path, lot: ExportPart, pictures: Pictures, tasks: dict[str, int]) -> None:
         self.folder, self.hand, self.pictures, self.tasks = folder, lot.hand, pictures, tasks
         self.frames, self.episodes = 0, list[dict[str, Any]]()
@@ -192,9 +186,7 @@ class _Writer:
             "features": self._features(),
         }
         (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n")
-        stats = {
-            name: _statistics(np.concatenate(some), picture=name == PICTURE) for name, some in self._values.items()
-        }
+        stats = {key: _statistics(np.concatenate(some), picture=key == PICTURE) for key, some in self._values.items()}
         (meta / "stats.json").write_text(json.dumps(stats, indent=4) + "\n")
         schema = parquet.schema_of({"task_index": "int64", "task": "text"}, {"pandas": json.dumps(_INDEXED)})
         rows = [{"task_index": number, "task": task_of(name)} for name, number in self.tasks.items()]
@@ -223,25 +215,19 @@ def task_of(name: str) -> str:
 def _statistics(values: NDArray[Any], *, picture: bool) -> dict[str, Any]:
     """Return statistics: of shape (n,) for frames (F, n), of shape (3, 1, 1) for pixels (P, 3)."""
     values = np.asarray(values, float)
-    found = {
-        "min": values.min(axis=0),
-        "max": values.max(axis=0),
-        "mean": values.mean(axis=0),
-        "std": values.std(axis=0),
-    }
+    found = {name: getattr(values, name)(axis=0) for name in ("min", "max", "mean", "std")}
     found |= {name: np.quantile(values, share, axis=0) for name, share in _QUANTILES.items()}
     shaped = {name: (one[:, None, None] if picture else one).tolist() for name, one in found.items()}
     return shaped | {"count": [len(values)]}
 
 
-#: Number of postures at the end of a trajectory: pregrasp, grasp, squeeze, lift.
-_STOPS = 4
-#: Largest size of `info.json` [bytes].
-_LARGEST = 2**22
+_STOPS = 4  # number of postures at the end of a trajectory: pregrasp, grasp, squeeze, lift
+_LARGEST = 2**22  # largest size of `info.json` [bytes]
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read one object's grasps on tables, with their approaches if all have equally many waypoints."""
+    """Read one object's grasps on tables, with approaches if all have the same number of waypoints.
+    Raises InputError: files are invalid or not from graspd, or `object_name` selects no single object."""
     names = _names(path)
     task = _task(path, object_name)
     ways, rest, numbers = _trajectories(path, task)
@@ -289,7 +275,7 @@ def _task(path: Path, object_name: str) -> int:
 
 
 def _trajectories(path: Path, task: int) -> tuple[list[Floats], Floats, list[int]]:
-    """Return all postures (W, 7 + J) of a task's episodes, the object's poses, and the episodes' numbers."""
+    """Return postures (W, 7 + J), object pose and number of each of a task's episodes."""
     ways, rest, numbers = list[Floats](), list[Floats](), list[int]()
     wanted = (STATE, ACTION, OBJECT, EPISODE, "frame_index", "task_index")
     for file in sorted((path / "data").glob("*/*.parquet")):

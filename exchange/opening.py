@@ -1,4 +1,4 @@
-"""Check of an export before it completes: a library for each file's format opens the file."""
+"""Check of exported files: a library for each file's format opens the file."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree
 
+import h5py
 import numpy as np
 import yaml
+from PIL import Image
 
 from graspd.service.model.errors import GraspdError
 from graspd.service.parquet import arrow
@@ -21,7 +23,7 @@ from graspd.service.parquet import arrow
 
 @contextmanager
 def check_written_files(folder: Path) -> Iterator[None]:
-    """Open all files written into a folder in this context; GraspdError: a library cannot read one."""
+    """Open all files that this context writes to a folder. Raises GraspdError: a library cannot read one."""
     before = _stamps(folder)
     yield
     for path, stamp in sorted(_stamps(folder).items()):
@@ -30,6 +32,7 @@ def check_written_files(folder: Path) -> Iterator[None]:
 
 
 def _stamps(folder: Path) -> dict[Path, tuple[int, int]]:
+    """Return time of change and size of each file."""
     found = ((path, path.stat()) for path in folder.rglob("*") if path.is_file())
     return {path: (stat.st_mtime_ns, stat.st_size) for path, stat in found}
 
@@ -38,8 +41,8 @@ def _open(path: Path, library: str, read: Callable[[Path], Any]) -> None:
     try:
         read(path)
     except ImportError:
-        return  # The writer did not need this library, so the reader of the export may use another one.
-    except Exception as error:  # Each library raises its own errors.
+        return  # an optional library that the writer did not need
+    except Exception as error:  # libraries raise arbitrary exceptions
         why = " ".join(str(error).split())[:300]
         raise GraspdError(
             f"{path} was written but {library} cannot read it ({why}); report this with the shard"
@@ -68,8 +71,6 @@ def _rows(path: Path) -> None:
 
 
 def _hdf5(path: Path) -> None:
-    import h5py
-
     with h5py.File(path) as file:
         file.visititems(lambda _, item: item[()] if isinstance(item, h5py.Dataset) else None)
 
@@ -80,8 +81,6 @@ def _tar(path: Path) -> None:
 
 
 def _picture(path: Path) -> None:
-    from PIL import Image
-
     with Image.open(path) as image:
         image.verify()
 
@@ -105,7 +104,7 @@ READERS: Final[dict[str, tuple[str, Callable[[Path], Any]]]] = {
     ".json": ("json", lambda path: json.loads(path.read_bytes())),
     ".jsonl": ("json", lambda path: [json.loads(line) for line in path.read_text().splitlines()]),
     ".csv": ("csv", _rows),
-    # Safe, since graspd has just written the file. DexGraspBench's files are pickled dictionaries.
+    # Pickles, which DexGraspBench has, are safe here, since graspd has just written the file.
     ".npy": ("NumPy", lambda path: np.load(path, allow_pickle=True)),
     ".npz": ("NumPy", np.load),
     ".h5": ("h5py", _hdf5),

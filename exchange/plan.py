@@ -28,14 +28,12 @@ class ExportPart:
     """Exported grasps of one base shard."""
 
     id: str
-    name: str
-    """Name of the object, fit for files; a repeated name gets a part of the later object's digest."""
+    name: str  # name of the object, fit for files; a repeated name gets a part of the later object's digest
     hand: HandModel
     obj: ObjectModel
     grasps: GraspSet
     rows: NDArray[np.intp]
-    verdict: NDArray[np.int8]
-    """(N,) verdicts: 1 held, 0 dropped, -1 not validated."""
+    verdict: NDArray[np.int8]  # (N,) verdicts: 1 held, 0 dropped, -1 not validated
     shard: Shard
     placed: PlacedGrasps | None = None
 
@@ -46,8 +44,8 @@ class ExportPart:
 
 
 def held_out_objects(kinds: Mapping[str, str], share: float) -> frozenset[str]:
-    """Return the objects of a share of the families; a hash selects these families.
-    At least one family is chosen and one is not; a single family is not chosen."""
+    """Return the objects of a share of the families; `kinds` has each object's family, and a hash selects families.
+    At least one family is held out and at least one is not; a single family is not held out."""
     order = sorted(set(kinds.values()), key=lambda kind: hashlib.sha256(kind.encode()).digest())
     chosen = order[: min(max(1, round(share * len(order))), len(order) - 1)]
     return frozenset(name for name, kind in kinds.items() if kind in chosen)
@@ -58,21 +56,16 @@ class PictureReference:
     """One picture: its index among the pictures, and its scene."""
 
     index: int
-    base: str
-    """Id of the shard with the scene's grasps."""
-    shard: str
-    """Id of the views shard."""
+    base: str  # id of the shard with the scene's grasps
+    shard: str  # id of the views shard
     scene: int
-    extrinsics: Floats
-    """(4, 4) transformation from the table's frame to the camera's."""
-    object_pose: Floats
-    """(7,) object pose in the table's frame."""
-    rows: NDArray[np.intp]
-    """Rows of the base shard whose grasps belong to this scene."""
+    extrinsics: Floats  # (4, 4) transformation from the table's frame to the camera's
+    object_pose: Floats  # (7,) object pose in the table's frame
+    rows: NDArray[np.intp]  # rows of the base shard whose grasps belong to this scene
 
 
 def pictures_without_pixels(pictures: Pictures) -> Iterator[PictureReference]:
-    """Yield references to the pictures; of a stereo pair, only the left picture."""
+    """Yield references to all pictures, except right pictures of stereo pairs."""
     for index, place in enumerate(pictures.places):
         camera = pictures.columns_of(place, ("camera/extrinsics", "camera/eye"))
         if camera["camera/eye"] == RIGHT:
@@ -84,12 +77,11 @@ def pictures_without_pixels(pictures: Pictures) -> Iterator[PictureReference]:
         yield PictureReference(index, found["base_id"], place.file.id, place.scene, extrinsics, pose, rows)
 
 
-#: Value of `camera/eye` for the right picture of a stereo pair.
-RIGHT: Final = 2
+RIGHT: Final = 2  # value of `camera/eye` for the right picture of a stereo pair
 
 
 def by_scene(pictures: Pictures) -> list[list[PictureReference]]:
-    """Group pictures by views shard and scene, in the order of the pictures."""
+    """Return the pictures of each scene of each views shard."""
     scenes: dict[tuple[str, int], list[PictureReference]] = defaultdict(list)
     for look in pictures_without_pixels(pictures):
         scenes[look.shard, look.scene].append(look)
@@ -102,11 +94,11 @@ class ExportSummary:
 
     counts: dict[str, Any]
     notes: list[str] = field(default_factory=list)
-    """Lines for the user: assumptions, omissions and their reasons."""
+    """Messages for the user: assumptions, omissions and their reasons."""
 
 
 def plain_name(name: str) -> str:
-    """Return a name fit for files and addresses; long names are cut, with a log message."""
+    """Return a name fit for files and URLs; long names are cut, with a log message."""
     return shorten(re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "unnamed")
 
 

@@ -1,22 +1,17 @@
 """Readers of published grasp sets: DDGC, DexGraspNet, MultiDex (GenDexGrasp), `reference-grasps/1`.
 
-Lundell et al., DDGC, RA-L 2021. Each object of the scene has a list of grasps. A grasp has position and quaternion x y
-z w of the hand in the object's frame, and eight joint angles, positive towards closing. These are the spread, medial
-and distal angles of finger 1, the same of finger 2, then the medial and distal angle of finger 3.
+DDGC (Lundell et al., RA-L 2021): a list of grasps per object. A grasp has position and quaternion x y z w of the hand
+in the object's frame, and eight joint angles, positive towards closing, in the order of `ROLES`.
 
-DexGraspNet's layout: a `.npy` file per object with a list of dictionaries: `scale`, and `qpos` by joint name.
+DexGraspNet (Wang et al., ICRA 2023): a `.npy` file per object with a list of dictionaries. `scale` multiplies the mesh.
+`qpos` has the root's translation WRJTx, y, z [m] and its rotation WRJRx, y, z: Euler angles about the fixed axes x, y,
+z in turn [rad]. Joints are `robot0:FFJ3` ... of the MuJoCo Shadow hand, with numbers one less than in the URDF.
 
-Wang et al., DexGraspNet, ICRA 2023. `qpos` has the root's translation WRJTx, y, z [m] and its rotation WRJRx, y, z:
-Euler angles about the fixed axes x, y, z in turn [rad]. Joints are `robot0:FFJ3` ... of the MuJoCo Shadow hand; their
-numbers are one less than in the URDF (FFJ4 ...). The object's mesh is multiplied by `scale`.
+MultiDex (Li et al., GenDexGrasp, ICRA 2023): a torch file with a list `metadata` of tuples (..., q, object, robot). `q`
+has the root's translation [m], the first two columns of its rotation matrix, and the joints in the order of the robot's
+URDF. Some versions of the file have three Euler angles (rotating axes x, y, z) instead of columns.
 
-MultiDex, the dataset of GenDexGrasp: a torch file with a list `metadata` of (..., q, object, robot) tuples.
-
-Li et al., GenDexGrasp, ICRA 2023. `q` has the root's translation [m], the first two columns of its rotation matrix, and
-the joints in the order of the robot's URDF. The original entries begin with a contact map, which later versions of the
-file omit. Some versions give the rotation as three Euler angles (rotating axes x, y, z).
-
-Reference grasps as JSON (`reference-grasps/1`): poses as matrices, joints by name, with published scores."""
+Reference grasps (`reference-grasps/1`): JSON with poses as matrices, joints by name, and published scores."""
 
 from __future__ import annotations
 
@@ -49,7 +44,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 
-#: Patterns of the joints' names, in the order of the file: finger and phalanx in words, or the maker's numbers.
+#: Patterns of joint names, in the file's order: spread, medial and distal of finger 1 and 2, medial and distal of 3.
 ROLES: Final = tuple(
     rf"(?=.*{finger}).*({words})|j{finger}{number}"
     for finger, phalanges in (("1", "smd"), ("2", "smd"), ("3", "md"))
@@ -59,7 +54,7 @@ ROLES: Final = tuple(
 
 def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
     """Read grasps on object `number` of `barrett_translation_K.npy` and `barrett_representation_K.npy`.
-    Joint names of the Barrett hand contain the finger (1, 2, 3) and the phalanx (spread or prox, med, dist)."""
+    Raises InputError, like all readers here: files are invalid, or hand or object do not fit."""
     beside = path.with_name(path.name.replace("translation", "representation"))
     if beside == path or not beside.is_file():
         raise InputError(f"{path} needs its barrett_representation_K.npy in the same folder")
@@ -132,7 +127,7 @@ def _grasp(path: Path, hand: HandModel, rows: list[dict[str, Any]]) -> Posture:
 
 
 def _urdf_name(name: str, hand: HandModel) -> str:
-    """Map `robot0:FFJ3` to the URDF's FFJ4, perhaps with a prefix such as `rh_`; keep other names."""
+    """Return the URDF's name, FFJ4 or with a prefix rh_FFJ4, of a joint `robot0:FFJ3`; keep other names."""
     if not name.startswith(_MUJOCO):
         return name
     plain = name.removeprefix(_MUJOCO)
@@ -141,8 +136,7 @@ def _urdf_name(name: str, hand: HandModel) -> str:
 
 
 def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: str) -> list[ImportedGrasps]:
-    """Read the grasps of one robot (`allegro`) on one object (`contactdb+mug`) in `cmap_dataset.pt`.
-    torch loads only tensors and basic types of Python."""
+    """Read the grasps of one robot (`allegro`) on one object (`contactdb+mug`) in `cmap_dataset.pt`."""
     rows = [row for row in _metadata(path) if len(row) >= 3 and row[-1] == robot and row[-2] == object_name]
     if not rows:
         raise InputError(f"{path} has no grasp of {robot!r} on {object_name!r}")
@@ -157,7 +151,7 @@ def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: s
 
 
 def rotation_of_columns(columns: Floats) -> Floats:
-    """Return quaternions (N, 4) of rotations from their first two columns (N, 6), both corrected equally."""
+    """Return quaternions (N, 4) of rotations from two columns (N, 6); both turn equally to be orthogonal."""
     x, y = (_unit(part) for part in (columns[:, :3], columns[:, 3:]))
     middle, across = _unit(x + y), _unit(x - y)
     x, y = _unit(middle + across), _unit(middle - across)

@@ -1,9 +1,7 @@
 """Views in the layout of Omniverse Replicator's BasicWriter.
 
-The export has the image files of `worker.rendering.export`. Structured arrays `bounding_box_2d_tight_NNNN.npy`,
-`..._2d_loose_NNNN.npy` and `..._3d_NNNN.npy` have JSON files `_labels_` and `_prim_paths_`. Further files are
-`semantic_segmentation_labels_NNNN.json` and `camera_params_NNNN.json`. USD's conventions: matrices act on row vectors,
-cameras look along -z with y up, pixels count from the upper left."""
+The export has the image files of `worker.rendering.export`, and arrays of bounding boxes with JSON files of labels,
+prims and cameras. USD's conventions: matrices act on row vectors, cameras look along -z with y up."""
 
 from __future__ import annotations
 
@@ -48,9 +46,9 @@ def write(views: Shard, folder: Path) -> list[Path]:
 
 
 def box_3d(corners: Floats, extrinsics: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the least and greatest corner (3,) of a box in its own centred frame, and this frame's pose.
-    The pose (4, 4) in the world acts on row vectors. `corners` (8, 3) are in the camera frame. Corner k has the
-    greatest x, y, z along the box's axes if bit 0, 1, 2 of k is set."""
+    """Return least and greatest corner (3,) of a box in its own centred frame, and this frame's pose (4, 4).
+    The pose, in the world, acts on row vectors. `corners` (8, 3) are in the camera frame. Corner k has the greatest x,
+    y, z along the box's axes if bit 0, 1, 2 of k is set."""
     world = (corners - extrinsics[:3, 3]) @ extrinsics[:3, :3]
     edges = np.stack([world[1 << axis] - world[0] for axis in range(3)])
     half = 0.5 * np.linalg.norm(edges, axis=1)
@@ -61,7 +59,7 @@ def box_3d(corners: Floats, extrinsics: Floats) -> tuple[Floats, Floats, Floats]
 
 
 def camera_params(views: Shard, view: int) -> dict[str, Any]:
-    """Return the camera of a view with BasicWriter's keys, in USD's conventions."""
+    """Return BasicWriter's parameters of a view's camera."""
     height, width = views["image/rgb"].shape[1:3]
     k, extrinsics = (np.asarray(views[f"camera/{name}"][view], float) for name in ("intrinsics", "extrinsics"))
     near, far = NEAR_FAR_M
@@ -90,7 +88,7 @@ def _annotations(views: Shard, view: int, name: str, folder: Path) -> list[Path]
     boxes: dict[str, NDArray[Any]] = {}
     for kind in ("tight", "loose"):
         corners = np.asarray(views[f"box/bounding_box_2d_{kind}"][view], float)
-        # A missing box is omitted, as BasicWriter omits unseen objects.
+        # BasicWriter omits unseen objects, whose box is not finite here.
         found = [(0, *np.rint(corners).astype(int), hidden)] if np.isfinite(corners).all() else []
         boxes[f"bounding_box_2d_{kind}"] = np.array(found, _BOX_2D)
     low, high, transform = box_3d(

@@ -1,4 +1,4 @@
-"""Export of a shard for robots: chosen grasps with their trajectories, written in one format."""
+"""Export of a shard's grasps with their trajectories in the format of a robot or simulator."""
 
 from __future__ import annotations
 
@@ -37,26 +37,24 @@ from graspd.worker.validation.decomposition import decompose
 
 @dataclass(frozen=True)
 class RobotExportOptions:
-    """Options of the user, as on the command line."""
+    """Options of `graspd export` for robots."""
 
     hand: str | None = None
     obj: str | None = None
     unvalidated: bool = False
     every: bool = False
-    best: int = 0
-    """Largest number of grasps, best epsilon first; 0 for all, in the order of the shard."""
+    best: int = 0  # largest number of grasps, best epsilon first; 0 for all, in the order of the shard
     tool: str | None = None
-    speed: float = 0.5
-    """Share of the velocity limits that trajectories use."""
-    arm: str | None = None
-    """Description of the arm; the next three fields place the arm and mount the hand."""
+    speed: float = 0.5  # share of the velocity limits that trajectories use
+    arm: str | None = None  # description of the arm; the next three fields place the arm and mount the hand
     mount: str | None = None
     base: str | None = None
     mount_pose: str | None = None
 
 
 def export_grasps(source: Path, format_: str, wishes: RobotExportOptions, folder: Path) -> ExportSummary:
-    """Write grasps of a base shard in the format of a robot or its simulator."""
+    """Write grasps of a base shard in the format of a robot or its simulator.
+    Raises InputError: options contradict each other, or no grasp can be executed."""
     if not 0 < wishes.speed <= 1:
         raise InputError(f"--speed is {wishes.speed:g}; give a share of the velocity limits above 0 and at most 1")
     if wishes.arm is None and (wishes.mount or wishes.base or wishes.mount_pose):
@@ -122,20 +120,16 @@ def _plan_executions(
     rows = best_of(shard.arrays, len(mask), mask) if wishes.best else np.flatnonzero(mask)
     tool = tool_frame(wishes.tool, case.hand.root_link, description.links)
     grasps, placed = case.grasps.take(rows), None if case.placed is None else case.placed.take(rows)
-    quality = _quality(shard, rows)
+    valid = np.asarray(shard.arrays["quality/valid"])
+    success = np.asarray(shard.arrays.get("quality/success", np.full(len(valid), -1)))
+    epsilon = metric_at_threshold(shard.arrays, "quality/epsilon")
+    quality: dict[str, NDArray[Any]] = {"valid": valid[rows], "success": success[rows], "epsilon": epsilon[rows]}
     found = executions(case.hand, case.obj, grasps, rows=rows, tool=tool, quality=quality, placed=placed)
     if lost := len(rows) - len(found):
         written.notes.append(
             f"{lost} of {len(rows)} {word} are left out: no straight approach of 10 cm is free of the object"
         )
     return found
-
-
-def _quality(shard: Shard, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
-    arrays = shard.arrays
-    success = np.asarray(arrays.get("quality/success", np.full(len(arrays["quality/valid"]), -1)))
-    epsilon = metric_at_threshold(arrays, "quality/epsilon")[rows]
-    return {"valid": np.asarray(arrays["quality/valid"])[rows], "success": success[rows], "epsilon": epsilon}
 
 
 def _assumptions(limits: Limits) -> list[str]:

@@ -33,7 +33,7 @@ def write_scored(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Path:
     """Validate and measure a set of grasps; write a base shard and the object's mesh to `folder`.
-    Grasps in scenes are tested by a lift along a trajectory that is planned here."""
+    Grasps in scenes get a new trajectory and a lift test. Raises InputError: the file exists, or no such level."""
     name = plain_name(found.name)
     path = folder / f"{plain_name(found.hand.name)}-{name}-{ordinal:03}.h5"
     if path.exists():
@@ -49,17 +49,18 @@ def write_scored(
     made = score_grasps(found.hand, obj, found.grasps, request, scenes=scenes, run=run)
     folder.mkdir(parents=True, exist_ok=True)
     mesh = mesh_file(found.obj, folder / f"{name}-{found.scale:g}.obj")
+    digest = digest_files(AssetKind.OBJECT, files_from_path(mesh)[1])
     attributes: dict[str, Attribute] = {
         "hand": found.hand.name,
         "hand_digest": found.hand.digest,
         "object": name,
-        "object_digest": _digest(mesh),
+        "object_digest": digest,
         "object_scale": found.scale,
         "method": f"imported:{origin.format}",
         "source": origin.source,
         "licence": origin.licence,
         "fidelity": json_attribute({"face_error_m": 0.0}),
-        "shard_id": digest_json([origin.source, found.hand.digest, _digest(mesh), ordinal, len(found.grasps)]),
+        "shard_id": digest_json([origin.source, found.hand.digest, digest, ordinal, len(found.grasps)]),
         "batch": ordinal,
     }
     attributes |= base_attributes(found.hand, obj, request, candidates=made.candidates, verdict_key=made.verdict_key)
@@ -67,13 +68,9 @@ def write_scored(
     if found.published is not None and (found.published >= 0).any():
         arrays["quality/published"] = found.published
     if scenes is not None:
-        # Imported grasps have no scene but a table.
+        # Importers support no other scene than a table.
         attributes["scene"] = json_attribute(SceneSpec(kind="table").model_dump(mode="json"))
         arrays["scene/object_pose"] = scenes.object_pose
         arrays["scene/rest_probability"] = np.full(len(scenes.object_pose), np.nan)
     path.write_bytes(write_shard("base", arrays, attributes))
     return path
-
-
-def _digest(mesh: Path) -> str:
-    return digest_files(AssetKind.OBJECT, files_from_path(mesh)[1])

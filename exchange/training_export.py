@@ -1,8 +1,7 @@
 """Export of shards as training folders of other projects: grasps, pictures, splits by object family.
 
 Objects of a family have similar distributions of the distance between two random surface points (D2 of Osada et al.,
-"Shape distributions", 2002). Distances are divided by their root mean square. Rotated, moved, mirrored, scaled and
-remeshed copies have the same distribution."""
+"Shape distributions", 2002), relative to its root mean square. Moved, mirrored, scaled or remeshed copies are equal."""
 
 from __future__ import annotations
 
@@ -28,20 +27,19 @@ from graspd.worker.objects.model import ObjectModel
 
 @dataclass(frozen=True)
 class TrainingExportOptions:
-    """Options of the user, as on the command line."""
+    """Options of `graspd export` for training formats."""
 
     hand: str | None = None
     obj: str | None = None
     unvalidated: bool = False
     every: bool = False
     held_out: float = 0.2
-    noise: str = ""
-    """Name of a depth camera; empty for perfect depth."""
+    noise: str = ""  # name of a depth camera; empty for perfect depth
 
 
 def export_training(source: Path, format_: str, wishes: TrainingExportOptions, folder: Path) -> ExportSummary:
     """Write the grasps of all shards in a folder in a training format.
-    All writers take grasps (`lots`) and held-out objects (`out`); some take pictures and a depth camera's noise."""
+    Raises InputError: the share is invalid, no shard has suitable grasps, or the format refuses them."""
     if not 0 < wishes.held_out < 1:
         raise InputError(f"--held-out is {wishes.held_out:g}; give a share of the objects between 0 and 1")
     shards = open_shards(source)
@@ -84,7 +82,7 @@ def _export_parts(shards: Shards, format_: str, wishes: TrainingExportOptions) -
 
 
 def _exported_rows(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.ndarray:
-    """Return a mask (N,) of exported grasps. GraspGen's format has labels, so it gets failed grasps too."""
+    """Return a mask (N,) of exported grasps: with failed ones for GraspGen, whose format has labels."""
     if format_ != "graspgen":
         return select_grasps(shard, unvalidated=wishes.unvalidated, every=wishes.every)[0]
     validated = validity.validated_mask(shard.arrays)
@@ -96,9 +94,9 @@ def _exported_rows(shard: Shard, format_: str, wishes: TrainingExportOptions) ->
 #: Number of point pairs, and compared quantiles of their distances.
 PAIRS: Final = 40_000
 QUANTILES: Final = np.linspace(0.01, 0.99, 50)
-#: Two shapes count as one below this root mean square difference of their quantiles. 14 scanned objects were turned,
-#: mirrored, scaled and simplified to 3 mm: copies differ by at most 0.0043. The two most similar objects differ by
-#: 0.0095. Too large families hardly affect a split. Too small families put copies into both of its parts.
+#: Root mean square difference of quantiles below which two shapes are similar. Turned, mirrored, scaled and simplified
+#: (3 mm) copies of 14 scanned objects differ by at most 0.0043, the two most similar objects by 0.0095. Too large
+#: families hardly affect a split; too small ones put copies into both of its parts.
 SAME: Final = 0.006
 
 
@@ -115,7 +113,7 @@ def shape_signature(obj: ObjectModel) -> Floats:
 
 
 def object_families(objects: Mapping[str, ObjectModel]) -> dict[str, str]:
-    """Return each object's family, named by the least digest of all transitively similar objects."""
+    """Return each object's family: the least digest of all objects that a chain of similar ones connects."""
     names = sorted(objects, key=lambda name: objects[name].digest)
     found = np.array([shape_signature(objects[name]) for name in names]).reshape(len(names), len(QUANTILES))
     family: dict[str, str] = {}

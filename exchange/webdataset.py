@@ -1,8 +1,6 @@
 """Pictures with their grasps as WebDataset tar files: members that share a key are one sample.
 
-Each picture has `KEY.rgb.png`, `KEY.depth.exr` (float32 [m]), `KEY.segmentation.png` and `KEY.json`. The JSON has
-camera, boxes, and grasps of the scene that are clear of the table, in the camera's frame. Data that a views shard lacks
-are omitted."""
+docs/how-to/exchange/webdataset.md describes the members. Data that a views shard lacks are omitted."""
 
 from __future__ import annotations
 
@@ -28,7 +26,8 @@ _COLUMNS: Final = ("image/rgb", "image/depth", "image/segmentation", "camera/int
 def write(
     shards: Shards, folder: Path, *, pictures_a_file: int = 1000, valid: bool = True, unvalidated: bool = False
 ) -> list[Path]:
-    """Write the pictures of views shards to `pictures-NNNNNN.tar`; `Pictures` selects their grasps."""
+    """Write the pictures of views shards to `pictures-NNNNNN.tar`; `Pictures` selects their grasps.
+    Raises InputError: there are no pictures, or `folder` has such files already."""
     pictures = Pictures(
         shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), valid=valid, unvalidated=unvalidated
     )

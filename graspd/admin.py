@@ -3,7 +3,4 @@
 import typer
 
 app = typer.Typer()
-app.add_typer(
-    typer.Typer(no_args_is_help=True, help="Maintenance: compile kernels, rebuild the index, repair the store."),
-    name="admin",
-)
+app.add_typer(typer.Typer(no_args_is_help=True, help="Maintenance of kernels, index and store."), name="admin")

@@ -1,4 +1,4 @@
-"""Root of the command line: lists the commands of all packages and imports each module on first use."""
+"""Root of the command line; it lists the commands of all packages, and imports a module on its first use."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from graspd.service.model.errors import did_you_mean
 from graspd.service.model.libraries import mark_process, pause_garbage_collection
 from graspd.service.model.version import PACKAGE_VERSION
 
+#: Name, module, panel of the overview, and help of each command.
 COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("demo", "graspd.demo", "Make grasps", "Make grasps, scenes and pictures of built-in data, and a results page."),
     ("synth", "graspd.commands.synth", "Make grasps", "Generate grasps of a hand file on an object file."),
@@ -58,6 +59,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("admin", "graspd.admin", "Administration", "Maintenance: kernels, index, store."),
 )
 
+#: Commands in a group of another package: group, name, module and help.
 JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("admin", "kernels", "graspd.commands.worker", "Compile all kernels ahead of time."),
     ("admin", "index", "graspd.service.run.commands", "Rebuild the index from the store or export its tables."),
@@ -68,7 +70,7 @@ JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("datasets", "card", "graspd.commands.exchange", "Write a dataset's card: contents, quality, biases, plots."),
 )
 
-#: Module that each package needs, and the extra that installs it: a container image has only the packages it needs.
+#: For each package: a module that it needs, and the extra that installs this module.
 PACKAGES: Final[dict[str, tuple[str, str]]] = {
     "graspd.api": ("fastapi", "api"),
     "graspd.client": ("fastapi", "api"),
@@ -80,16 +82,16 @@ UsageError: Final[Any] = typer.BadParameter.__base__
 
 
 class LazyGroup(TyperGroup):
-    """Group whose overview needs no import: calling a command imports its package."""
+    """Group whose overview needs no import; a call of a command imports its package."""
 
     def main(self, *args: Any, **extra: Any) -> Any:
-        """Run the command; a usage error prints one line and exits with code 2, like any other invalid input."""
+        """Run the command; a usage error prints one line and exits with code 2."""
         try:
             code = super().main(*args, **extra | {"standalone_mode": False})
         except UsageError as error:
             code = error.exit_code
-            if said := usage_line(error):  # Without a line, help is already printed.
-                typer.echo(f"graspd: {said}", err=True)
+            if line := usage_line(error):  # Without a line, help is already printed.
+                typer.echo(f"graspd: {line}", err=True)
         except typer.Abort:
             code = 1
             typer.echo("graspd: stopped at a prompt", err=True)
@@ -101,7 +103,7 @@ class LazyGroup(TyperGroup):
         # Completion omits commands whose package is not installed.
         if module is None or name is None or (ctx.resilient_parsing and missing_extra(module)):
             return name, command, rest
-        # A worker's image has no API, but still offers `hands check` and `objects check`.
+        # Without the API, as in a worker's image, `hands check` and `objects check` still work.
         package = next((package for parent, child, package, _ in JOINED if [parent, child] == [name, *rest[:1]]), None)
         if package and missing_extra(module):
             return f"{name} {rest[0]}", load(package, rest[0], ctx), rest[1:]
@@ -109,7 +111,7 @@ class LazyGroup(TyperGroup):
 
 
 class Deferred(TyperCommand):
-    """Placeholder in a group for a command of another package; calling it imports that package."""
+    """Placeholder in a group for a command of another package; a call imports that package."""
 
     def __init__(self, name: str, module: str, help: str) -> None:
         super().__init__(name, help=help)
@@ -122,7 +124,7 @@ class Deferred(TyperCommand):
 
 
 def load(module: str, name: str, ctx: Any = None) -> Any:
-    """Import a command of a package; print one line and exit with code 1 if the package is not installed."""
+    """Import a command; print one line and exit with code 1 if its package is not installed."""
     if missing := missing_extra(module):
         path = f"{ctx.command_path} {name}" if ctx else f"graspd {name}"
         typer.echo(f"graspd: `{path}` is not part of this install; run pip install 'graspd[{missing}]'", err=True)
@@ -142,7 +144,7 @@ def load(module: str, name: str, ctx: Any = None) -> Any:
 
 
 def usage_line(error: Any) -> str:
-    """Return one line with the usage error and a pointer to the valid input."""
+    """Return one line with the usage error and a hint; empty if there is nothing to report."""
     said = re.sub(r"\.?\s*Did you mean (.*)\?", r"; did you mean \1?", error.format_message()).rstrip(".")
     if hasattr(error, "possibilities"):
         said = f"there is no option {error.option_name}{did_you_mean(error.option_name, error.possibilities or ())}"
@@ -155,10 +157,8 @@ def usage_line(error: Any) -> str:
 
 
 def escape_help(command: Any) -> None:
-    """Escape brackets in the help of a command and its subcommands: typer reads `[mm]` as Rich markup.
-
-    `rich.markup.escape` does the same, but its import takes longer than most commands need to start.
-    """
+    """Escape brackets in the help of a command and its subcommands: typer reads `[mm]` as Rich markup."""
+    # `rich.markup.escape` does the same, but its import is slow.
     for one in (command, *command.params):
         for name in ("help", "short_help", "epilog"):
             if text := getattr(one, name, None):
@@ -203,7 +203,6 @@ def main() -> None:
     mark_process()
     # Commands do not draw with MuJoCo. Without this setting, its import would start a process to search for GLFW.
     os.environ.setdefault("MUJOCO_GL", "disable")
-    # Without this setting pydantic searches all installed packages for plugins. To enable plugins, set the variable to
-    # "".
+    # Without this setting, pydantic searches all installed packages for plugins; an empty variable enables them.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     run_command_line(build_app())

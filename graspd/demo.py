@@ -1,4 +1,4 @@
-"""`graspd demo`: run the whole service here, send it one job over HTTP, and write a page of results."""
+"""`graspd demo`: run the whole service in this folder, send it one job, and write a page of results."""
 
 from __future__ import annotations
 
@@ -25,10 +25,8 @@ from graspd.service.store.assets import builtin_files
 from graspd.service.store.shards import Shard, read_shard
 
 app = CommandGroup()
-
-
 _SHOWN_GRASPS: Final = 12
-#: Rays per pixel of a small picture; twice as many take twice the time and look almost the same.
+#: Rays per pixel of a picture.
 _SAMPLES: Final = 8
 
 
@@ -88,7 +86,7 @@ def print_results(console: Console, job: JobDetail, paths: dict[str, list[str] |
 
 
 def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> dict[str, list[str] | str]:
-    """Write a sheet of the best grasps, views of the first batch, and an index.html; return all paths."""
+    """Write a sheet of the best grasps, views of the first batch, and index.html; return all paths."""
     from graspd.worker.rendering.sheets import views_page
 
     pages: dict[str, bytes] = {}
@@ -110,7 +108,7 @@ def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> dict[str, list
 
 def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     """Return a PNG of the best grasps of a shard, ranked by ε."""
-    # Importing Warp takes seconds, so options are checked first.
+    # Warp is imported late, because its import takes seconds.
     from graspd.worker.engines import backend
     from graspd.worker.hands.load import load_hand
     from graspd.worker.objects.prepare import load_object
@@ -133,9 +131,8 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
 def html_page(job: JobDetail, pictures: list[Path], shards: list[Path], out: Path) -> str:
     """Return an HTML page that works without server or script."""
     title = f"{escape(job.hand)} × {escape(job.object)}"
-    images = "".join(
-        f'<figure><a href="{p.name}"><img src="{p.name}" alt="{_ALT[p.stem]}"></a></figure>' for p in pictures
-    )
+    figure = '<figure><a href="{0}"><img src="{0}" alt="{1}"></a></figure>'
+    images = "".join(figure.format(picture.name, _ALT[picture.stem]) for picture in pictures)
     files = "".join(f"<li><a href='{p.relative_to(out)}'>{p.relative_to(out)}</a></li>" for p in shards)
     return _HTML.format(title=title, yields=escape(yield_of(job)), job=job.id, images=images, files=files)
 

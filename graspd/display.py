@@ -59,7 +59,7 @@ def frame_of(grasps: Grasps) -> Any:
 
 
 def html_of(grasps: Grasps) -> str:
-    """Return `repr` and a picture of the best grasps as HTML; without a picture, a table of their metrics."""
+    """Return `repr` and a picture of the best grasps as HTML, or a table of their metrics without a picture."""
     head = f"<p>{escape(repr(grasps))}</p>"
     try:
         png = sheet_of(grasps, PICTURED, EDGE, PICTURE_S)
@@ -86,7 +86,7 @@ def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
 
 
 def sheet_of(grasps: Grasps, count: int, edge: int, limit_s: float = math.inf) -> bytes:
-    """Return a PNG of the best grasps, `edge` pixels each; errors as in `Grasps.plot`, and TaskCancelled."""
+    """Return a PNG of the best grasps, `edge` pixels each; raise TaskCancelled after `limit_s`."""
     from graspd.commands.grasp_sheet import GraspSheet
     from graspd.worker.engines.devices import Device
     from graspd.worker.execution_context import ExecutionContext

@@ -21,12 +21,7 @@ from graspd.service.run.doctor.checks import THREADS, Check, Condition, Finding,
 from graspd.service.settings import Settings
 
 app = CommandGroup(no_args_is_help=False)
-_COLOURS: Final = {
-    Condition.GOOD: typer.colors.GREEN,
-    Condition.WARNING: typer.colors.YELLOW,
-    Condition.BAD: typer.colors.RED,
-    Condition.SKIPPED: typer.colors.BRIGHT_BLACK,
-}
+_COLOURS: Final = {"good": "green", "warning": "yellow", "bad": "red", "skipped": "bright_black"}
 
 
 @app.command(epilog="graspd doctor --only redis,store,clocks")
@@ -38,7 +33,7 @@ def doctor(
 ) -> None:
     """Check disk, clocks, Redis, store, index, GPU, kernels and ports, and suggest fixes.
 
-    Changes nothing, and may run next to the service. Exit code 1: something needs a fix.
+    It changes nothing, and may run next to the service. Exit code 1: there is a fault.
     """
     settings = load_settings(data_dir=data_dir)
     logging.basicConfig(level=logging.ERROR)
@@ -59,7 +54,7 @@ def doctor(
 
 
 def _exit(code: int) -> None:
-    """Exit with a code, even while the thread of a timed-out check still hangs."""
+    """Exit with a code, even while the thread of a check hangs."""
     sys.stdout.flush()
     sys.stderr.flush()
     if any(thread.name.startswith(THREADS) for thread in threading.enumerate()):

@@ -1,4 +1,4 @@
-"""Grasps of one hand as arrays, with postures, metrics and verdicts; selection and sorting."""
+"""Grasps of one hand as arrays, with postures, metrics and verdicts."""
 
 from __future__ import annotations
 
@@ -312,9 +312,8 @@ class Grasps:
             raise InputError(f"a file holds grasps on one object; these are on {', '.join(self.objects)}")
         # With several files, the attributes are those of the first file, and do not describe another object.
         if self.objects and self.objects != [str(self._attributes.get("object", ""))]:
-            raise InputError(
-                f"these grasps were selected from several objects; open the file of {self.objects[0]} alone"
-            )
+            fix = f"open the file of {self.objects[0]} alone"
+            raise InputError(f"these grasps were selected from several objects; {fix}")
         said = {name: value for name, value in self._attributes.items() if name not in ("shard_id", "schema")}
         columns = {name: data for name, data in self._columns.items() if name != "object"}
         return Shard("base", said, columns, self._path)

@@ -4,17 +4,8 @@ from typing import Any
 
 from graspd.service.readers import Clouds, DepthNoise, Grasps, Pictures, ShardCache, ShardFile, Shards, open_shards
 
-__all__ = [
-    "Clouds",
-    "DepthNoise",
-    "Grasps",
-    "Pictures",
-    "ShardCache",
-    "ShardFile",
-    "Shards",
-    "hand_surface",
-    "open_shards",
-]
+__all__ = ["Clouds", "DepthNoise", "Grasps", "Pictures", "ShardCache", "ShardFile", "Shards"]
+__all__ += ["hand_surface", "open_shards"]
 
 
 def hand_surface(shard: Any, rows: Any) -> Any:

@@ -121,9 +121,8 @@ class Job:
         Raises:
             TaskError: it failed or was cancelled; finished grasps can still be fetched.
         """
-        self._said = self._http.wait(
-            self.id, on_progress=(lambda job: progress(float(job.progress))) if progress else None
-        )
+        on_progress = (lambda job: progress(float(job.progress))) if progress else None
+        self._said = self._http.wait(self.id, on_progress=on_progress)
         if self._said.state != State.SUCCEEDED:
             reasons = [attempt.reason for attempt in self._said.attempts]
             raise TaskError(f"job {self.id[:12]} ended {self.state}{': ' + reasons[-1] if reasons else ''}")

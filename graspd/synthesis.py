@@ -56,9 +56,9 @@ def synthesize(
         raise ImportError(f"synthesize needs {error.name}; run pip install 'graspd[worker]'") from error
     # None means that the option was not given.
     asked = validate(LocalOptions, {name: value for name, value in options.items() if value is not None})
-    told = (lambda done, total, _message: progress(done / total)) if progress else None
+    on_progress = (lambda done, total, _message: progress(done / total)) if progress else None
     try:
-        made = synthesize_with(str(hand), str(object), asked, progress=told)
+        made = synthesize_with(str(hand), str(object), asked, progress=on_progress)
     except InputError as error:
         # The engine's messages spell options as on the command line.
         error.args = (_FLAG.sub(lambda flag: _KEYWORDS.get(flag[0], flag[0]), str(error)),)

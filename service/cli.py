@@ -1,4 +1,4 @@
-"""Common parts of all commands: one-line errors with exit codes, JSON output, logs."""
+"""Code shared by all commands: one-line errors with exit codes, JSON output, logs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON object on
 
 
 def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
-    """Convert errors to one line on stderr and an exit code: 2 for invalid input, 130 for Ctrl-C, else 1."""
+    """Decorate a command: errors become a line on stderr and exit code 2 (input), 130 (Ctrl-C) or 1."""
 
     @functools.wraps(command)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -62,12 +62,12 @@ class CommandGroup(typer.Typer):
 
 
 def run_command_line(command: Callable[[], object]) -> None:
-    """Run the command; report system errors in one line; other exceptions are bugs and show their trace."""
+    """Run the command; report system errors in one line. Other exceptions keep their traceback."""
     for descriptor in range(3):
         try:
             os.fstat(descriptor)
         except OSError:
-            # Otherwise the next opened file gets this descriptor, and receives the printed output.
+            # Otherwise the next opened file gets this descriptor, and the printed output is written to it.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -91,16 +91,15 @@ def run_command_line(command: Callable[[], object]) -> None:
 def _refusal(error: OSError | MemoryError) -> str:
     if isinstance(error, MemoryError):
         return "there is not enough memory; provide more, or request less at once"
-    what = ", ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
-    said = f"{what}: {error.strerror}" if what and error.strerror else error.strerror or str(error)
+    paths = ", ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
+    problem = f"{paths}: {error.strerror}" if paths and error.strerror else error.strerror or str(error)
     fixes = {
-        errno.ENOSPC: "free disk space, or give another path",
-        errno.EDQUOT: "free disk space, or give another path",
         errno.EACCES: "give another path, or let this user write there",
         errno.EROFS: "give another path",
         errno.ENOENT: "check the name",
+        **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free disk space, or give another path"),
     }
-    return without_secrets(f"{said}; {fixes[error.errno]}" if error.errno in fixes else said)
+    return without_secrets(f"{problem}; {fixes[error.errno]}" if error.errno in fixes else problem)
 
 
 def _discard_output(stream: TextIO | None) -> None:
@@ -110,7 +109,7 @@ def _discard_output(stream: TextIO | None) -> None:
 
 
 def write_output(path: Path, content: bytes) -> None:
-    """Write an output file: atomically, unless the path is a device, a pipe or a link."""
+    """Write an output file atomically; a device, a pipe or the target of a link is written directly."""
     if path.is_symlink() or (path.exists() and not path.is_file()):
         path.write_bytes(content)
         return
@@ -126,25 +125,27 @@ def write_output(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def catch_stop_signals() -> Iterator[list[int]]:
-    """Yield a list for the first stop signal (Ctrl-C, SIGTERM); a second signal ends the process."""
-    asked: list[int] = []
+    """Yield a list that receives the first stop signal (Ctrl-C, SIGTERM); a second one ends the process."""
+    received: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
-    def note(number: int, _: Any) -> None:
-        asked.append(number)
-        for known, handler in before.items():
-            signal.signal(known, handler)
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def record(number: int, _: Any) -> None:
+        received.append(number)
+        restore()
 
     try:
         for number in before:
-            signal.signal(number, note)
-    except ValueError:  # Only the main thread can set handlers of signals.
+            signal.signal(number, record)
+    except ValueError:  # Only the main thread can set signal handlers.
         before = {}
     try:
-        yield asked
+        yield received
     finally:
-        for known, handler in before.items():
-            signal.signal(known, handler)
+        restore()
 
 
 def fail(message: str, code: int) -> NoReturn:
@@ -153,7 +154,7 @@ def fail(message: str, code: int) -> NoReturn:
 
 
 def plain_console(*, stderr: bool = False) -> Console:
-    """Return a terminal that prints verbatim; Rich reads `[red]` as a style and `:x:` as an emoji."""
+    """Return a console that prints verbatim; Rich would read `[red]` as a style and `:x:` as an emoji."""
     from rich.console import Console
 
     return Console(stderr=stderr, markup=False, emoji=False, highlight=False)
@@ -189,8 +190,8 @@ def load_settings(**overrides: Any) -> Settings:
     try:
         return Settings(**{name: value for name, value in overrides.items() if value is not None})
     except ValidationError as error:
-        place, said = error.errors()[0]["loc"], first_error(error)
-        raise InputError(f"GRASPD_{place[0]}".upper() + said.removeprefix(str(place[0])) if place else said) from None
+        place, text = error.errors()[0]["loc"], first_error(error)
+        raise InputError(f"GRASPD_{place[0]}".upper() + text.removeprefix(str(place[0])) if place else text) from None
 
 
 @dataclass(frozen=True)
@@ -214,7 +215,7 @@ def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
 
 
 def restrict_file_access(settings: Settings) -> None:
-    """Make the data folder, and new files of this process and its children, private to the user."""
+    """Make the data folder and all new files of this process and its children private to the user."""
     os.umask(0o077)
     with contextlib.suppress(OSError):
         status = settings.data_dir.stat()

@@ -1,4 +1,4 @@
-"""Command-line options from `service.model.options.rows`: each row has type, default and help text."""
+"""Command-line options, derived from the option tables of `service.model.options`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
@@ -16,6 +17,8 @@ from graspd.service.model.options import EVERYWHERE, ModelT, Place, Row, rows, v
 
 
 def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorate a command: replace its parameter `options` by one command-line option per row of `model`."""
+
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
         def wrapper(**given: Any) -> None:
@@ -26,37 +29,37 @@ def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[...
         own = list(inspect.signature(command, eval_str=True).parameters.values())
         at = [parameter.name for parameter in own].index("options")
         parameters = [*own[:at], *map(_parameter, added), *own[at + 1 :]]
-        parameters = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in parameters]
-        del wrapper.__wrapped__  # The wrapped command has another signature.
+        parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
+        del wrapper.__wrapped__  # The signature of the original command differs.
         wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        wrapper.__annotations__ = {one.name: one.annotation for one in parameters}
+        wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
         return wrapper
 
     return decorate
 
 
 def _parameter(row: Row) -> inspect.Parameter:
-    words = row.meaning[:1].upper() + row.meaning[1:]
+    text = row.meaning[:1].upper() + row.meaning[1:]
     if row.kind == list[str]:
-        words += "; repeatable"
+        text += "; repeatable"
     elif row.default not in (None, "") and row.kind is not bool:
-        words += f". Default: {row.default}"
+        text += f". Default: {row.default}"
     least, most = (row.bounds.get(key) if row.kind in (int, float) else None for key in ("ge", "le"))
-    option = typer.Option(*row.flags, help=f"{words}.", show_default=False, min=least, max=most)
+    option = typer.Option(*row.flags, help=f"{text}.", show_default=False, min=least, max=most)
     annotation: Any = Annotated[row.kind | None, option]
     return inspect.Parameter(row.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
 
 
 def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
-    """Validate the given options; InputError names the first invalid option as on the command line."""
+    """Validate the given options; InputError names the first invalid one as on the command line."""
     options = {row.name: row.flags[0].partition("/")[0] for place in EVERYWHERE for row in rows(model, place)}
     names = {name: f"--{name.replace('_', '-')}" for name in model.model_fields}
-    # The dataset's name is an argument, not an option.
+    # The name of a dataset is an argument, not an option.
     return validate(model, values, names={**names, "name": "NAME", **options})
 
 
 def parse_pairs(texts: Iterable[str]) -> dict[str, str | int | float]:
-    """Parse `name=value` of each `--option`; numeric values become numbers, as in a request's JSON."""
+    """Parse the `name=value` of each `--option`; numeric values become numbers, as in a request's JSON."""
     split = [text.partition("=") for text in texts]
     for name, equals, value in split:
         if not equals:
@@ -66,10 +69,8 @@ def parse_pairs(texts: Iterable[str]) -> dict[str, str | int | float]:
 
 def _number(text: str) -> str | int | float:
     for kind in (int, float):
-        try:
+        with suppress(ValueError):
             number = kind(text)
-        except ValueError:
-            continue
-        # Only canonical numbers are converted: 007 and nan stay text.
-        return number if str(number) == text and math.isfinite(number) else text
+            # Only canonical numbers are converted: 007 and nan stay text.
+            return number if str(number) == text and math.isfinite(number) else text
     return text

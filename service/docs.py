@@ -1,19 +1,20 @@
-"""Update of the documentation's tables and keyword stubs: `python -m graspd.service.docs`."""
+"""Update of generated tables in the docs, and of keyword stubs: `python -m graspd.service.docs`."""
 
 from __future__ import annotations
 
 import re
 import sys
 from collections.abc import Callable, Iterable
+from itertools import starmap
 from pathlib import Path
 from typing import Final
 
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.local_options import LocalOptions
-from graspd.service.model.options import Place, Row, keywords_of, rows
+from graspd.service.model.options import Row, keywords_of, rows
 from graspd.service.model.series import SERIES
 from graspd.service.settings import Settings
-from graspd.service.store.columns import ATTRIBUTES, SCHEMAS, ShardKind
+from graspd.service.store.columns import ATTRIBUTES, SCHEMAS, Column, ShardKind
 
 
 def _table(headings: str, rows: Iterable[Iterable[object]]) -> str:
@@ -23,12 +24,11 @@ def _table(headings: str, rows: Iterable[Iterable[object]]) -> str:
 
 
 def schema_table(kind: ShardKind) -> str:
-    absent = {True: " *(may be absent)*", False: ""}
-    cells = (
-        (f"`{path}`", f"({', '.join(c.shape.split())})", c.dtype, c.units, c.frame, c.description + absent[c.optional])
-        for path, c in SCHEMAS[kind].items()
-    )
-    return _table("dataset, shape, type, unit, frame, meaning", cells)
+    def cells(path: str, column: Column) -> tuple[str, ...]:
+        meaning = column.description + " *(may be absent)*" * column.optional
+        return f"`{path}`", f"({', '.join(column.shape.split())})", column.dtype, column.units, column.frame, meaning
+
+    return _table("dataset, shape, type, unit, frame, meaning", starmap(cells, SCHEMAS[kind].items()))
 
 
 def attributes_table() -> str:
@@ -59,16 +59,12 @@ def options_table() -> str:
     found += [(row, "here") for row in local if row.name not in same]
     order = list(LocalOptions.model_fields)
     found.sort(key=lambda one: order.index(one[0].name))
-    tables = []
-    for group in ("basic", "advanced"):
-        cells = (
-            (f"`{row.name}`", ", ".join(f"`{flag}`" for flag in row.flags), where, *_cells(row))
-            for row, where in found
-            if row.option.group == group
-        )
-        table = _table("option, command line, of, default, bounds, meaning", cells)
-        tables.append(f"## {group.capitalize()}\n\n{table}")
-    return "\n\n".join(tables)
+    tables: dict[str, list[tuple[str, ...]]] = {"basic": [], "advanced": []}
+    for row, where in found:
+        flags = ", ".join(f"`{flag}`" for flag in row.flags)
+        tables[row.option.group].append((f"`{row.name}`", flags, where, *_cells(row)))
+    headings = "option, command line, of, default, bounds, meaning"
+    return "\n\n".join(f"## {group.capitalize()}\n\n{_table(headings, cells)}" for group, cells in tables.items())
 
 
 def _cells(row: Row) -> tuple[str, str, str]:
@@ -83,13 +79,9 @@ def keywords_stub() -> str:
         "from pathlib import Path",
         "from typing import Any, Literal, TypedDict",
     ]
-    tables: tuple[tuple[str, type[JobOptions], Place], ...] = (
-        ("JobKeywords", JobOptions, "job"),
-        ("SynthesizeKeywords", LocalOptions, "python"),
-    )
-    for title, model, place in tables:
-        fields = [f"    {row.name}: {text}" for row, text in keywords_of(model, place)]
-        parts.append("\n".join(["", f"class {title}(TypedDict, total=False):", *fields]))
+    job, python = keywords_of(JobOptions, "job"), keywords_of(LocalOptions, "python")
+    for title, keywords in (("JobKeywords", job), ("SynthesizeKeywords", python)):
+        parts += ["", f"class {title}(TypedDict, total=False):", *(f"    {row.name}: {text}" for row, text in keywords)]
     return "\n".join(parts) + "\n"
 
 

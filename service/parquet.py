@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from graspd.service.model.errors import InputError
 
-#: Limit [bytes] of the unpacked size that a file of unknown origin states.
+#: Limit of the unpacked size that a file states [bytes].
 LARGEST: Final = 2**31
 #: Type of pictures for Hugging Face's readers: bytes and path of a file.
 IMAGE: Final = "image"
@@ -25,7 +25,7 @@ def arrow() -> Any:
 
 
 def type_of(name: str) -> Any:
-    """Return an Arrow type by name, such as `image`, `text`, `int64`; lists have a suffix [length] or []."""
+    """Return an Arrow type by name: `image`, `text`, `int64`, ..., with suffix [LENGTH] or [] for lists."""
     pa = arrow()
     if name.endswith("]"):
         inner, _, size = name[:-1].rpartition("[")
@@ -36,15 +36,15 @@ def type_of(name: str) -> Any:
 
 
 def schema_of(columns: Mapping[str, str], also: Mapping[str, str] | None = None) -> Any:
-    """Return the schema of columns with types as in `type_of`; mark pictures for Hugging Face's readers."""
+    """Return the schema of columns with the type names of `type_of`, and metadata for Hugging Face."""
     pa = arrow()
     pictures = {name: {"_type": "Image"} for name, word in columns.items() if word == IMAGE}
-    told = {"huggingface": json.dumps({"info": {"features": pictures}})} if pictures else {}
-    return pa.schema([(name, type_of(word)) for name, word in columns.items()], metadata=told | dict(also or {}))
+    metadata = {"huggingface": json.dumps({"info": {"features": pictures}})} if pictures else {}
+    return pa.schema([(name, type_of(word)) for name, word in columns.items()], metadata=metadata | dict(also or {}))
 
 
 def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]) -> int:
-    """Write rows, each group as one row group; return the number of rows."""
+    """Write each group of rows as one row group; return the number of rows."""
     pa = arrow()
     file.parent.mkdir(parents=True, exist_ok=True)
     count = 0
@@ -56,13 +56,12 @@ def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]
 
 
 def read(file: Path, wanted: Iterable[str]) -> dict[str, list[Any]]:
-    """Read the wanted columns that a file has; InputError if it is not Parquet or exceeds `LARGEST`."""
+    """Read those wanted columns that a file has; InputError for no Parquet file or more than `LARGEST`."""
     pa = arrow()
     try:
         with pa.parquet.ParquetFile(file) as found:
             names = [name for name in wanted if name in found.schema_arrow.names]
-            said = found.metadata
-            size = sum(said.row_group(k).total_byte_size for k in range(said.num_row_groups))
+            size = sum(found.metadata.row_group(k).total_byte_size for k in range(found.num_row_groups))
             if size > LARGEST:
                 raise InputError(f"{file} unpacks to {size >> 20} MiB; split it into files below {LARGEST >> 20} MiB")
             return dict(found.read(columns=names).to_pydict())

@@ -27,7 +27,7 @@ GONE: Final = {
 class Settings(BaseSettings):
     """Settings of all processes of one graspd. Defaults run everything on one machine inside `data_dir`."""
 
-    # Compose and Kubernetes pass unset variables as empty ones.
+    # Compose and Kubernetes set unset variables to an empty text.
     model_config = SettingsConfigDict(
         env_prefix="GRASPD_", env_ignore_empty=True, frozen=True, hide_input_in_errors=True
     )
@@ -40,13 +40,12 @@ class Settings(BaseSettings):
     )
     index_url: SecretStr | None = Field(None, description="SQLAlchemy URL of the index; unset: SQLite in data_dir")
     host: str = Field("127.0.0.1", description="address to which the API binds")
-    port: int = Field(8000, ge=0, le=65535, description="port to which the API binds; 0: any free one")
+    port: int = Field(8000, ge=0, le=65535, description="port to which the API binds; 0: any free port")
     api_root_path: str | None = Field(
         None, description="path under which a proxy serves the API and the dashboard, such as /graspd; unset: the root"
     )
     api_url: str = Field(
-        "http://127.0.0.1:8000",
-        description="address of the API for client commands; unset: the service of data_dir, if it runs",
+        "http://127.0.0.1:8000", description="address of the API for client commands; unset: the service of data_dir"
     )
     api_key: SecretStr | None = Field(None, description="API key of the client commands")
     keys_file: Path | None = Field(None, description="file of the API keys; unset: keys.json in data_dir")
@@ -58,25 +57,17 @@ class Settings(BaseSettings):
         {}, description='rights of proxy groups; the first match counts: {"lab": "vision:submit", "*": ":read"}'
     )
     metrics_need_key: bool = Field(True, description="whether /metrics requires a key once keys exist")
-    requests_per_minute: int = Field(
-        1200, ge=0, description="maximum requests per minute with one API key; 0: no limit"
-    )
+    requests_per_minute: int = Field(1200, ge=0, description="maximum requests per minute of one API key; 0: no limit")
     address_requests_per_minute: int = Field(
         120, ge=0, description="maximum requests per minute from one IP address without an API key; 0: no limit"
     )
-    concurrency: int = Field(
-        64, ge=0, description="maximum concurrent requests with one API key or from one IP address; 0: no limit"
-    )
+    concurrency: int = Field(64, ge=0, description="maximum concurrent requests of one key or IP address; 0: no limit")
     quota_grasps_in_flight: int = Field(
         0, ge=0, description="maximum number of grasps in unfinished jobs of one API key; 0: no limit"
     )
-    quota_jobs_per_day: int = Field(
-        0, ge=0, description="maximum new jobs of one API key per day, from midnight UTC; 0: no limit"
-    )
+    quota_jobs_per_day: int = Field(0, ge=0, description="maximum new jobs of one API key per UTC day; 0: no limit")
     webhook_secret: SecretStr | None = Field(
-        None,
-        min_length=16,
-        description="secret of API and controller from which the secrets of webhooks are derived; unset: no webhooks",
+        None, min_length=16, description="secret from which the secrets of webhooks are derived; unset: no webhooks"
     )
     webhook_networks: str | None = Field(
         None, description="networks that webhooks may reach besides public addresses, separated by commas"
@@ -90,50 +81,34 @@ class Settings(BaseSettings):
     )
     threads: int = Field(0, ge=0, description="CPU threads of a worker; 0: one per core")
     processes: int = Field(
-        0,
-        ge=0,
-        le=1024,
-        description="processes for validation and metrics. 1: the worker itself; 0: with a GPU the number of cores "
-        "minus one, else 1",
+        0, ge=0, le=1024, description="processes for validation and metrics; 0: all cores but one with a GPU, else 1"
     )
     workers_here: int = Field(1, ge=1, description="workers on this machine that share its cores and memory")
     join: str = Field(
         "auto",
         pattern=r"^(auto|[1-9][0-9]{0,3})$",
-        description="batches of a task that a worker plans in one launch; auto: as many as fill its GPU, 1 on a CPU",
+        description="number of a task's batches per kernel launch; auto: as many as fill the GPU, 1 on a CPU",
     )
     lease_s: float = Field(6.0, gt=0.5, description="time without a heartbeat after which a worker loses its task [s]")
     controller_interval_s: float = Field(1.0, gt=0, description="pause between two rounds of the controller [s]")
     controller_name: str | None = Field(
-        None,
-        max_length=200,
-        description="name of a controller; a restart under the same name leads at once; unset: a new name",
+        None, max_length=200, description="name of a controller, which leads at once after a restart; unset: a new name"
     )
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
     task_s: float = Field(
-        60.0,
-        ge=0,
-        description="target duration of tasks of large jobs [s]; it sets the number of batches per task; 0: one batch",
+        60.0, ge=0, description="target duration of a task [s], which sets its number of batches; 0: one batch"
     )
     task_timeout_s: float = Field(1800.0, gt=0, description="maximum run time of one task [s]")
     worker_max_memory_mb: int = Field(
         0, ge=0, description="resident memory at which a worker is replaced [MiB]; 0: half of all memory"
     )
-    retry_backoff_s: float = Field(
-        2.0, ge=0, description="wait before the second attempt [s]; doubled before each further attempt"
-    )
-    max_upload_bytes: int = Field(
-        64 * 2**20, gt=0, description="largest upload of a hand, object or network over HTTP [bytes]"
-    )
+    retry_backoff_s: float = Field(2.0, ge=0, description="delay of the second attempt [s], doubled before later ones")
+    max_upload_bytes: int = Field(64 * 2**20, gt=0, description="largest HTTP upload of an asset [bytes]")
     queue_window: int = Field(
-        1000,
-        ge=1,
-        description="maximum tasks in the queue per priority, at least two per worker; further tasks wait in the index",
+        1000, ge=1, description="maximum queued tasks per priority, at least two per worker; others wait in the index"
     )
     shard_grace_s: float = Field(
-        7 * 86400.0,
-        ge=0,
-        description="time during which deletions can be restored, and shards that no job needs stay stored [s]",
+        7 * 86400.0, ge=0, description="time during which deletions can be restored and unused shards are kept [s]"
     )
     integrity_scan_mb_per_s: float = Field(
         1.0, ge=0, description="rate at which the controller's integrity scan reads the store [MiB/s]; 0: off"

@@ -1,4 +1,4 @@
-"""Telemetry of every process: log lines, heartbeat file for health checks."""
+"""Telemetry of each process: log lines, and a heartbeat file for health checks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _TALKATIVE: Final = ("rq.worker", "rq.job", "rq.queue", "httpx")
 
 @contextmanager
 def bind_subjects(**subjects: Any) -> Iterator[None]:
-    """Add non-empty subjects to log lines of a `with` block; threads started in it do not inherit them."""
+    """Add non-empty subjects to the log lines of a `with` block, but not of threads started in it."""
     token = _bound.set({**_bound.get(), **{name: value for name, value in subjects.items() if value}})
     try:
         yield
@@ -42,7 +42,7 @@ def bound_subject(subject: str) -> str:
 
 
 def set_up_logs(settings: Settings, process: str = "graspd") -> None:
-    """Log the lines of this process to stderr; `process` is its name in JSON lines."""
+    """Write the log of this process to stderr; `process` is its name in JSON lines."""
     is_text = settings.log_format == "text" or (settings.log_format == "auto" and sys.stderr.isatty())
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_TextLines() if is_text else JsonLines(process))
@@ -84,7 +84,7 @@ class _TextLines(logging.Formatter):
         return without_secrets(f"{text} [{about}]{trace}" if about else f"{text}{trace}")
 
 
-#: Characters that end a line or control a terminal: foreign paths and names must not forge lines.
+#: Characters that end a line or control a terminal; with them, foreign paths and names could forge lines.
 _OBEYED: Final = {
     code: repr(chr(code))[1:-1]
     for code in (*range(0x20), *range(0x7F, 0xA0), 0x2028, 0x2029, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
@@ -113,7 +113,7 @@ class HeartbeatFile:
         self._again = 0.0
 
     def touch(self) -> None:
-        """Update the heartbeat at most every few seconds. A full disk is logged once and otherwise ignored."""
+        """Update the file at most every few seconds; after an error, log a warning and stop updates."""
         now = time.monotonic()
         if self._path is None or now < self._again:
             return

@@ -1,7 +1,7 @@
 """The user's cache of reproducible files, each complete, verified and private.
 
-Processes share a folder without locks: entries appear by renaming, and two writers of one entry write equal content.
-Damaged or foreign entries count as absent; a failed write only costs time.
+Processes share a folder without locks: writes are atomic, and two writers of one entry write equal content. Damaged or
+foreign entries count as absent; a failed write only costs time.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ def load(file: Path) -> bytes | None:
 
 
 def store(file: Path, content: bytes, *, limit_bytes: int = _LIMIT_BYTES) -> None:
-    """Write an entry with its SHA-256; evict the folder's least recently used entries above `limit_bytes`."""
+    """Write an entry with its SHA-256; evict the least recently used entries beyond `limit_bytes`."""
     with suppress(OSError):
         write_atomically(file, [hashlib.sha256(content).digest(), content])
         evict(file.parent, file.suffix, limit_bytes, keep=file)
 
 
 def write_atomically(file: Path, pieces: Iterable[bytes]) -> None:
-    """Create the folder and write a file atomically, readable by this user only; none if `pieces` raises."""
+    """Create the folder and write a file atomically, private to this user; no file if `pieces` raises."""
     file.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
     partial = Path(name)
@@ -72,30 +72,30 @@ def evict(folder: Path, suffix: str, limit_bytes: int, *, keep: Path) -> None:
     for _, size, file in sorted(found, reverse=True):
         used += size
         if used > limit_bytes and file != keep:
-            # A process with the open file can still read it.
+            # Processes that have opened the file can still read it.
             file.unlink(missing_ok=True)
 
 
 @lru_cache(maxsize=8)
 def _root(xdg: str, home: str, temporary: str) -> Path:
-    """Return the root of all caches; cached by its inputs, so that problems are logged once."""
+    """Return the root of all caches; the cache of results logs a problem only once."""
     try:
-        # A relative $XDG_CACHE_HOME counts as unset, as its specification requires.
+        # By specification, a relative $XDG_CACHE_HOME counts as unset.
         base = Path(xdg) if Path(xdg).is_absolute() else (Path(home) if home else Path.home()) / ".cache"
         root = base / "graspd"
         root.mkdir(parents=True, exist_ok=True)
         if os.access(root, os.W_OK | os.X_OK):
             return root
-        trouble = f"{root} cannot be written"
+        problem = f"{root} cannot be written"
     except (OSError, RuntimeError) as error:
-        trouble = str(error)
+        problem = str(error)
     root = _private(Path(temporary))
-    log.warning("no cache in the home folder (%s); reproducible files are in %s", trouble, root)
+    log.warning("no cache in the home folder (%s); reproducible files are in %s", problem, root)
     return root
 
 
 def _private(temporary: Path) -> Path:
-    """Create a folder writable by this user only. A folder of another user at this path is not used."""
+    """Create a private folder; return `/dev/null` if another user owns the path."""
     mine = temporary / f"graspd-cache-{os.geteuid()}"
     with suppress(OSError):
         mine.mkdir(mode=0o700, exist_ok=True)

@@ -1,6 +1,4 @@
-"""Planner throughput by fidelity, batch, threads, hand points and object faces: table, JSON and plot.
-
-Batches are timed as a whole, iterations launch by launch. Host time is measured apart from kernels."""
+"""Planner throughput by fidelity, batch and threads, with times of kernels and of the host: table, JSON, plot."""
 
 from __future__ import annotations
 
@@ -33,8 +31,7 @@ from graspd.worker.simulation.launches import kernel_seconds
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_iteration
 
-#: Largest number of grasps per launch with which host time is measured.
-LARGE: Final = 1024
+LARGE: Final = 1024  # largest number of grasps in the measurement of host time
 
 
 def bench(
@@ -50,10 +47,9 @@ def bench(
     say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Time each combination of fidelity, batch, joins and threads; `say` receives a line per combination.
-    `load` loads the object at a fidelity's simplification error bound [m]; `joins` are numbers of batches per launch.
-    The median of `repeats` timed calls is reported, after an untimed call. A GPU ignores `threads`. Return `device`,
-    `runs[]` with a row per combination, `start` with seconds to the first and the next grasp, and `kernels`. It also
-    has `host_ms_per_grasp`, but None on a GPU, because waiting threads are busy there."""
+    `load` loads the object at an error bound of its mesh [m]; `joins` are numbers of batches per launch. Times are
+    medians of `repeats` calls, after an untimed call. A GPU ignores `threads`. `host_ms_per_grasp` is None on a GPU,
+    because waiting threads are busy there."""
     first = fidelities[0]
     nominal = load(first.face_error_m)
     start = _start_times(hand, nominal, first, device)
@@ -61,7 +57,7 @@ def bench(
     for fidelity in fidelities:
         obj = load(fidelity.face_error_m)
         for batch, join, count in product(batches, joins, threads):
-            run = _run(hand, obj, fidelity, batch, join, count, device, repeats)
+            run = _run(hand, obj, fidelity, batch, join, ExecutionContext(device, count), repeats)
             runs.append(run)
             say(
                 f"{fidelity.name:9s} batch {batch:5d} x {join} threads {count}: {run['grasps_per_second']:8.1f} "
@@ -83,7 +79,7 @@ def bench(
 
 
 def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str) -> dict[str, float]:
-    """Return seconds to the first grasp (fresh process; kernels cached or compiled), and to the next one."""
+    """Return seconds to the first grasp of this process, which loads or compiles kernels, and to the next."""
     seconds = []
     for seed in (0, 1):
         began = time.perf_counter()
@@ -93,20 +89,13 @@ def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: 
 
 
 def _run(
-    hand: HandModel,
-    obj: ObjectModel,
-    fidelity: Fidelity,
-    batch: int,
-    join: int,
-    threads: int,
-    device: str,
-    repeats: int,
+    hand: HandModel, obj: ObjectModel, fidelity: Fidelity, batch: int, join: int, run: ExecutionContext, repeats: int
 ) -> dict[str, Any]:
-    seconds, run = [], ExecutionContext(threads=threads, device=device)
+    seconds = []
     for seed in range(repeats + 1):
         began = time.perf_counter()
         asked = [BatchRequest(PlanRequest(batch, fidelity, seed, number), run) for number in range(join)]
-        optimise(pair_of(hand, obj, fidelity, device), Batches(asked, obj), run)
+        optimise(pair_of(hand, obj, fidelity, run.device), Batches(asked, obj), run)
         seconds.append(time.perf_counter() - began)
     typical = median(seconds[1:])
     iterations = fidelity.coarse_iterations + fidelity.fine_iterations
@@ -115,7 +104,7 @@ def _run(
         "batch": batch,
         "join": join,
         "grasps": batch * join,
-        "processes": threads,
+        "processes": run.threads,
         "hand_points": fidelity.fine_points,
         "coarse_points": fidelity.coarse_points,
         "faces": len(obj.faces),
@@ -124,7 +113,7 @@ def _run(
         "grasps_per_second": round(join * batch / typical, 3),
         "seconds": round(typical, 4),
         "spread": round((max(seconds[1:]) - min(seconds[1:])) / typical, 3),
-        "peak_memory_mb": round(_peak_memory_mb(device), 1),
+        "peak_memory_mb": round(_peak_memory_mb(run.device), 1),
     }
 
 
@@ -134,13 +123,11 @@ def _peak_memory_mb(device: str) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-#: Number of iterations that are timed launch by launch, in the middle of a phase.
-SAMPLED: Final = 12
+SAMPLED: Final = 12  # number of iterations that are timed launch by launch, in the middle of a phase
 
 
 def kernel_shares(pair: Pair, fidelity: Fidelity, count: int) -> dict[str, Any]:
-    """Return ms per iteration of each phase, time shares of kernels, and closest-point queries per second.
-    `count` grasps are planned at once, on one thread."""
+    """Return time per iteration [ms], shares of kernels and queries per second of each phase, for `count` grasps."""
     state = sample_starts(pair.model(pair.coarse), seed=0, batch=0, indices=range(count), each=1)
     phases: dict[str, Any] = {}
     for name, side, schedule in (
@@ -203,9 +190,7 @@ def _timed(
 
 
 def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
-    """Return host time per candidate on the CPU [ms]: time of one thread outside the planner's kernels.
-    It includes starts, merits, projection, the postures around the grasp, copies and launches. A first batch of `count`
-    grasps fills the caches."""
+    """Return host time per candidate [ms]: time of one CPU thread outside the planner's kernels, with full caches."""
     run = ExecutionContext("cpu", threads=1)
     plan(hand, obj, PlanRequest(count, fidelity, seed=1), run)
     with kernel_seconds() as elsewhere:
@@ -221,11 +206,12 @@ def device_name(device: str) -> str:
 
 
 def clock_of(device: str) -> Callable[[], float]:
-    """Return a clock: core-seconds of all threads on a CPU (nearly load-independent), wall clock on a GPU."""
+    """Return a clock: core-seconds of all threads on a CPU, where other load hardly matters; wall clock on a GPU."""
     return time.process_time if device == "cpu" else time.perf_counter
 
 
 def table(result: dict[str, Any]) -> str:
+    """Return the result of `bench` in Markdown."""
     lines = [
         f"{result['hand']} on {result['object']}, {result['device']}, graspd {result['versions']['graspd']}, "
         f"Warp {result['versions']['warp']}",
@@ -276,9 +262,7 @@ def _plot(result: dict[str, Any], path: Path) -> None:
     batches = sorted({r["grasps"] for r in result["runs"]})
     axes.set_xscale("log", base=2)
     axes.set_xticks(batches, [str(batch) for batch in batches], minor=False)
-    axes.set_xlabel("grasps per call")
-    axes.set_ylabel("grasps per second")
-    axes.set_ylim(bottom=0)
+    axes.set(xlabel="grasps per call", ylabel="grasps per second", ylim=(0, None))
     axes.set_title(f"{result['hand']} on {result['object']}, {result['device']}", loc="left", fontsize=11)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
@@ -37,8 +37,7 @@ from graspd.worker.validation.validator import Verdicts, validate
 
 Protocol = Literal["dexgraspbench", "displacement", "lift"]
 
-#: Contact threshold of contact area, epsilon and volume [m]: the paper's.
-THRESHOLD_M: Final = 0.005
+THRESHOLD_M: Final = 0.005  # contact threshold of contact area, epsilon and volume [m]: the paper's
 #: Keys of the row, and the metrics of grasps whose medians they contain.
 COLUMNS: Final = {
     "pd_mm": "penetration_depth_mm",
@@ -48,7 +47,7 @@ COLUMNS: Final = {
     "epsilon": "epsilon",
     "wrench_volume": "wrench_volume",
 }
-#: Seed of the models around the nominal one. No job uses it, so these models are independent of a job's selection.
+#: Seed of the models around the nominal one; no job uses it, so that a job's selection does not bias the result.
 MODELS_SEED: Final = 2**31
 
 
@@ -69,21 +68,16 @@ def evaluate(
 
     Level dexgraspbench uses the mass and friction of its protocol, other levels those of the object.
 
-    - Settings: n, protocol, level, hard, mu, mass_kg, object_friction.
-    - Success: gsr (share that holds), osr (1 if any holds), sgs (held grasps per second of planning and validation),
-      sgs_without_validation (per second of planning alone).
-    - Medians: pd_mm and spd_mm (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm.
-    - Set: diversity (variance explained by the first principal component), nearest_mm (least distance of two grasps).
-    - After validation: verdicts, see `_verdict_rows`.
-    - With `models` models around the nominal one: robust_share (mean over held grasps), robust_n (their number),
-      robust_axes (share by axis). `tell` receives the results.
-    - With protocol lift: clear_share (no collision with the scene in approach, closing and lift).
-    - With another model of the hand as `validation_hand`: `ForeignVerdicts.facts`; in verdicts held_foreign and
-      reason_foreign.
+    - gsr: share that holds; osr: 1 if any holds; sgs: held grasps per second of planning and validation;
+      sgs_without_validation: per second of planning alone; verdicts: see `_verdict_rows`
+    - medians of pd_mm and spd_mm (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm
+    - diversity: variance explained by the first principal component; nearest_mm: least distance of two grasps
+    - with `models` models around the nominal one: robust_share (mean over held grasps), robust_n (their number),
+      robust_axes (share by axis); `tell` receives the results
+    - protocol lift: clear_share, without collision in approach, closing and lift
+    - with another model of the hand, `validation_hand`: `ForeignVerdicts.facts`, held_foreign and reason_foreign
 
-    Raises:
-        InputError: protocol lift on grasps of a free object, or dexgraspbench with an unknown level.
-    """
+    Raises InputError: protocol lift on grasps of a free object, or dexgraspbench with an unknown level."""
     if protocol == "lift" and case.placed is None:
         raise InputError(f"{case.name} has free grasps, but a lift test needs a scene: graspd synth --scene")
     case = case.centred
@@ -91,15 +85,8 @@ def evaluate(
         case = replace(case, obj=case.obj.for_dexgraspbench)
     mu = friction or case.friction or DEFAULT_FRICTION
     table = measure(case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], run=run)
-    row: dict[str, Any] = {
-        "n": len(case.grasps),
-        "protocol": protocol,
-        "level": None,
-        "hard": hard,
-        "mu": mu,
-        "mass_kg": case.obj.mass,
-        "object_friction": case.obj.friction,
-    }
+    row: dict[str, Any] = {"n": len(case.grasps), "protocol": protocol, "level": None, "hard": hard, "mu": mu}
+    row |= {"mass_kg": case.obj.mass, "object_friction": case.obj.friction}
     row |= dict.fromkeys(("gsr", "osr", "sgs", "sgs_without_validation", "agreement_published"))
     try:
         pieces = decompose(case.obj, cache=cache)
@@ -131,10 +118,22 @@ def evaluate(
 def _model_results(
     case: Case, grasps: GraspSet, row: dict[str, Any], models: int, tell: Callable[[Robustness], None], **given: Any
 ) -> dict[str, Any]:
-    """Return results of models around the nominal one; add each grasp's share to its verdict."""
+    """Return results of models around the nominal one.
+    Add to each verdict in `row` the grasp's share (None if not tested) and first failing axis."""
     found = validate_robustness(case.hand, case.obj, grasps, models=models, seed=MODELS_SEED, **given)
     tell(found)
-    return _in_models(found, row.get("verdicts", []))
+    tried = np.isfinite(found.share)
+    for one, share, weakest in zip(row.get("verdicts", []), found.share, found.weakest, strict=True):
+        known = math.isfinite(share)
+        one |= {"robust_share": _plain(share) if known else None, "robust_weakest": axis_word(int(weakest))}
+    counts = found.by_axis()
+    return {
+        "robust_share": _plain(float(found.share[tried].mean())) if tried.any() else None,
+        "robust_models": found.held.shape[1],
+        "robust_n": int(tried.sum()),
+        "robust_seconds": _plain(found.seconds),
+        "robust_axes": {axis.word: {"share": _plain(held / n), "n": n} for axis, (held, n) in counts.items()},
+    }
 
 
 def _success(case: Case, verdicts: Verdicts) -> dict[str, Any]:
@@ -153,7 +152,7 @@ def _success(case: Case, verdicts: Verdicts) -> dict[str, Any]:
         "published": 0,
         "reasons": dict(Counter(verdicts.reasons).most_common()),
         "verdict_key": verdicts.terms,
-        "verdicts": _verdict_rows(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, Outcome),
+        "verdicts": _verdict_rows(verdicts, verdicts.outcome, Outcome),
         "agreement_published": None,
     }
     if case.published is not None and (known := case.published >= 0).any():
@@ -165,14 +164,14 @@ def _success(case: Case, verdicts: Verdicts) -> dict[str, Any]:
 def _with_trajectories(case: Case, placed: PlacedGrasps) -> tuple[GraspSet, NDArray[np.bool_]]:
     way, grasps = plan_trajectory(case.hand, case.obj, case.grasps, placed), case.grasps
     if grasps.approach is None or grasps.coming is None:
-        # Imported files have grasps but rarely have trajectories.
+        # Imported files rarely have trajectories.
         grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
     return grasps, way.clear
 
 
 def _lift_rates(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, Any]:
     count, held = len(clear), int(verdicts.success.sum())
-    rows = _verdict_rows(verdicts.success, verdicts.outcome[:, None], verdicts.margin, verdicts.reasons, LiftOutcome)
+    rows = _verdict_rows(verdicts, verdicts.outcome[:, None], LiftOutcome)
     return {
         "level": verdicts.level,
         "gsr": _plain(held / max(1, count)),
@@ -185,30 +184,11 @@ def _lift_rates(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, A
     }
 
 
-def _in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return a row's shares; add to each verdict its share (None if not tested) and first failing axis."""
-    tried = np.isfinite(found.share)
-    for one, share, weakest in zip(verdicts, found.share, found.weakest, strict=True):
-        known = math.isfinite(share)
-        one |= {"robust_share": _plain(share) if known else None, "robust_weakest": axis_word(int(weakest))}
-    counts = found.by_axis()
-    return {
-        "robust_share": _plain(float(found.share[tried].mean())) if tried.any() else None,
-        "robust_models": found.held.shape[1],
-        "robust_n": int(tried.sum()),
-        "robust_seconds": _plain(found.seconds),
-        "robust_axes": {axis.word: {"share": _plain(held / n), "n": n} for axis, (held, n) in counts.items()},
-    }
-
-
 def _verdict_rows(
-    success: NDArray[Any],
-    outcomes: NDArray[Any],
-    margins: NDArray[np.float64],
-    reasons: Sequence[str],
-    kind: type[IntEnum],
+    verdicts: Verdicts | LiftVerdicts, outcomes: NDArray[Any], kind: type[IntEnum]
 ) -> list[dict[str, Any]]:
-    """Return for each grasp row, held, outcomes of pushes or lift, margin (None if diverged), reason."""
+    """Return row, held, outcomes of pushes or lift, margin (None if diverged) and reason of each grasp."""
+    columns = zip(verdicts.success, outcomes, verdicts.margin, verdicts.reasons, strict=True)
     return [
         {
             "row": row,
@@ -217,7 +197,7 @@ def _verdict_rows(
             "margin": _plain(margin) if math.isfinite(margin) else None,
             "reason": reason,
         }
-        for row, (held, own, margin, reason) in enumerate(zip(success, outcomes, margins, reasons, strict=True))
+        for row, (held, own, margin, reason) in enumerate(columns)
     ]
 
 
@@ -243,7 +223,7 @@ def _plain(value: float) -> float:
     return round(float(value), 6)
 
 
-#: Numbers that are combined by medians over rows.
+#: Keys that `combine` summarises by medians over rows.
 _MEDIANS: Final = (*COLUMNS, "cdc_mm", "sd_cm", "diversity")
 
 
@@ -253,7 +233,7 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
         return dict(rows[0])
     out: dict[str, Any] = {"n": sum(row["n"] for row in rows)}
     for key in ("protocol", "level", "hard", "mu"):
-        # Without a common value in all rows the value is None.
+        # None stands for different values.
         out[key] = rows[0][key] if all(row[key] == rows[0][key] for row in rows) else None
     validated = [row for row in rows if row["gsr"] is not None]
     out["gsr"] = _rate(validated, "gsr", "n")
@@ -263,8 +243,7 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
     out["agreement_published"] = _rate(validated, "agreement_published", "published")
     if any("robust_share" in row for row in rows):
         out |= _models([row for row in rows if "robust_share" in row])
-    counted = [row["foreign_held"] for row in rows if "foreign_held" in row]
-    if counted:
+    if counted := [row["foreign_held"] for row in rows if "foreign_held" in row]:
         out |= share_counts({key: sum(one[key] for one in counted) for key in counted[0]})
         out["fingertips_mm"] = max(row["fingertips_mm"] for row in rows if "foreign_held" in row)
     for key in ("sgs", "sgs_without_validation"):

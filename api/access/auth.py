@@ -1,15 +1,14 @@
 """Authentication of a request by key, session cookie or proxy; permissions of the caller.
 
-Before the first key, every user of this machine may use the service, and nobody else. Afterwards requests need a key,
-even if all keys are revoked or expired. A proxy may authenticate people (OIDC). It sends their groups in
-X-Forwarded-Groups, and `Authorization: Basic user:secret` (option `--basic-auth-password` of oauth2-proxy). Any client
-can send such headers, so the connection's address and the secret must be the proxy's, and no header may be duplicate.
+Before the first key, only requests from this machine are answered. Afterwards requests need a key, even if all keys are
+revoked or expired. A proxy may authenticate people (OIDC). It sends their groups in X-Forwarded-Groups, and
+`Authorization: Basic user:secret` (option `--basic-auth-password` of oauth2-proxy). Any client can send such headers:
+the connection's address and the secret must be the proxy's, and no header may be duplicate.
 """
 
 from __future__ import annotations
 
 import base64
-import binascii
 import hashlib
 import hmac
 import ipaddress
@@ -57,11 +56,8 @@ def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
         return None
     key: Key | None = request.scope.get("state", {}).get("key")
     if key is None:
-        raise ApiError(
-            401,
-            "a valid key is needed: send `Authorization: Bearer gd_...`; `graspd keys add` makes one",
-            headers={"WWW-Authenticate": 'Bearer realm="graspd"'},
-        )
+        problem = "a valid key is needed: send `Authorization: Bearer gd_...`; `graspd keys add` makes one"
+        raise ApiError(401, problem, headers={"WWW-Authenticate": 'Bearer realm="graspd"'})
     if not key.scope.includes(scope):
         raise ApiError(403, f"the key {key.name!r} has scope {key.scope}; this needs {scope}")
     return key
@@ -90,11 +86,8 @@ def require_ownership(owner: str, what: str, project: str = "") -> None:
     if not may_change(owner, project):
         key = caller.get()
         assert key is not None
-        raise ForeignResource(
-            403,
-            f"{what} does not belong to the key {key.name!r}; use a key of its project (without a project: the key "
-            "that submitted it), or a key with scope admin",
-        )
+        fix = "use a key of its project (without a project: the key that submitted it), or a key with scope admin"
+        raise ForeignResource(403, f"{what} does not belong to the key {key.name!r}; {fix}")
 
 
 def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
@@ -107,24 +100,21 @@ def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
 
 def _refuse_strangers(request: HTTPConnection) -> None:
     """Refuse requests from other machines, and from proxies, because these may forward any request."""
-    passed_on = next((name for name in _OF_PROXIES if name in request.headers), None)
+    header = next((name for name in _OF_PROXIES if name in request.headers), None)
     address = request.client.host if request.client else ""
-    if passed_on is None and not _is_remote(address):
-        return
-    by = f"through a proxy (header {passed_on})" if passed_on else f"from {address}"
-    raise ApiError(
-        403,
-        f"this service has no keys, so it answers only its own machine; this request came {by}; "
-        "make a key with `graspd keys add NAME --scope admin`",
-    )
+    if header or _is_remote(address):
+        origin = f"through a proxy (header {header})" if header else f"from {address}"
+        problem = f"this service has no keys, so it answers only its own machine; this request came {origin}"
+        raise ApiError(403, f"{problem}; make a key with `graspd keys add NAME --scope admin`")
 
 
 def identify(scope: AsgiScope, keys: KeyFile, proxy: Proxy) -> Key | None:
+    """Return the key of a request: by its Bearer token, by the proxy, or by its session cookie."""
     scheme, _, token = Headers(scope=scope).get("authorization", "").partition(" ")
     if scheme.lower() == "bearer" and token:
         return keys.find(token.strip())
-    if person := proxy.find(scope):
-        return person
+    if key := proxy.find(scope):
+        return key
     cookie = HTTPConnection(scope).cookies.get(SESSION_COOKIE)
     return keys.find_session(cookie) if cookie else None
 
@@ -168,10 +158,7 @@ class Proxy:
             return None
         headers = Headers(scope=scope)
         given, groups = headers.getlist("authorization"), headers.getlist(GROUPS)
-        if len(given) != 1 or len(groups) > 1:
-            return None
-        user = self._user(given[0])
-        if not user:
+        if len(given) != 1 or len(groups) > 1 or not (user := self._user(given[0])):
             return None
         theirs = {group.strip() for group in (groups[0] if groups else "").split(",")} | {ANYBODY}
         rights = next((rights for group, rights in self._groups.items() if group in theirs), None)
@@ -188,13 +175,11 @@ class Proxy:
     def _user(self, authorization: str) -> str:
         """Return the user of Basic credentials (RFC 7617) with the proxy's secret; empty for all others."""
         scheme, _, credentials = authorization.partition(" ")
-        if scheme.lower() != "basic":
-            return ""
         try:
             user, _, secret = base64.b64decode(credentials.strip(), validate=True).partition(b":")
-        except (binascii.Error, ValueError):
+        except ValueError:
             return ""
-        if not hmac.compare_digest(secret, self._secret):
+        if scheme.lower() != "basic" or not hmac.compare_digest(secret, self._secret):
             return ""
         name = user.decode(errors="replace").lower()
         return name if len(name) <= _LONGEST_USER and _USER.fullmatch(name) else ""
@@ -217,7 +202,6 @@ def _network(text: str) -> ipaddress.IPv4Network | ipaddress.IPv6Network:
 def _rights(group: str, said: str) -> tuple[str, Scope]:
     project, _, scope = said.partition(":")
     if (project and not re.fullmatch(PATTERN, project)) or scope not in set(Scope):
-        raise InputError(
-            f"GRASPD_PROXY_GROUPS: {said!r} of {group!r} is not PROJECT:SCOPE; write vision:submit, or :admin"
-        )
+        fix = "write vision:submit, or :admin"
+        raise InputError(f"GRASPD_PROXY_GROUPS: {said!r} of {group!r} is not PROJECT:SCOPE; {fix}")
     return project, Scope(scope)

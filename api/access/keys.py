@@ -56,9 +56,7 @@ class ProjectLimits(BaseModel):
 
     grasps_in_flight: int | None = Field(None, ge=0, description="maximum grasps in unfinished jobs")
     grasps_per_day: int | None = Field(None, ge=0, description="requested grasps per day (UTC)")
-    gpu_seconds_per_day: int | None = Field(
-        None, ge=0, description="GPU time of its tasks per day (UTC) [s]; once it is used up, new jobs are refused"
-    )
+    gpu_seconds_per_day: int | None = Field(None, ge=0, description="GPU time of tasks per day (UTC) [s]")
 
 
 class Key(BaseModel):
@@ -76,7 +74,7 @@ class Key(BaseModel):
 
     @model_validator(mode="after")
     def _has_an_id(self) -> Self:
-        # Keys stored before ids existed get an id from their name, because both secrets of a rotation share the name.
+        # Keys of an earlier version have no id; both secrets of a rotation share the name, and so get the same id.
         self.id = self.id or _sha256(f"name {self.name}")[:16]
         return self
 
@@ -124,12 +122,12 @@ class KeyFile:
         project: str = "",
     ) -> str:
         """Make a key and return it; it cannot be shown again. An empty project is the unnamed project."""
+        token = PREFIX + secrets.token_urlsafe(32)
         with self._changing() as document:
             if any(key.name == name and key.is_live for key in document.keys):
                 raise ConflictError(f"there is a key named {name!r}; revoke or rotate it, or take another name")
             if "@" in name:
                 raise InputError(f"{name!r} is no key name: names with an @ are reserved for users of a proxy")
-            token = PREFIX + secrets.token_urlsafe(32)
             try:
                 key = Key(
                     id=secrets.token_hex(8),
@@ -153,9 +151,8 @@ class KeyFile:
         token = PREFIX + secrets.token_urlsafe(32)
         with self._changing() as document:
             old = _live(document, name)
-            fresh = old[-1].model_copy(
-                update={"sha256": _sha256(token), "created": _now(), "expires": _now(lifetime) if lifetime else None}
-            )
+            dates = {"created": _now(), "expires": _now(lifetime) if lifetime else None}
+            fresh = old[-1].model_copy(update={"sha256": _sha256(token), **dates})
             for key in old:
                 if grace:
                     key.expires = min(_now(grace), key.expires or _now(grace))
@@ -229,9 +226,8 @@ class KeyFile:
             try:
                 self._document = _Document.model_validate_json(self.path.read_bytes())
             except (ValidationError, OSError) as error:
-                raise UnavailableError(
-                    f"the key file {self.path} cannot be read; restore it, or remove it to begin anew"
-                ) from error
+                fix = "restore it, or remove it to begin anew"
+                raise UnavailableError(f"the key file {self.path} cannot be read; {fix}") from error
             self._stamp = stamp
         return self._document
 

@@ -1,6 +1,6 @@
 """Quotas of keys and projects: grasps in unfinished jobs, jobs or grasps per day. Idempotency keys.
 
-All API processes count in Redis, each submission in one atomic step. A loss of Redis resets quotas, but loses no job.
+All API processes count in Redis, each submission in one atomic step. A loss of Redis resets the counters.
 From submission to end, a job counts with its requested grasps. The index is queried for ended jobs only if the quota
 would be exceeded, so a submission needs one round trip.
 """
@@ -12,7 +12,7 @@ import uuid
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from typing import Any, Final
 
 from redis.exceptions import RedisError
@@ -103,7 +103,7 @@ end
 
 @dataclass
 class SubmissionClaim:
-    """Result of a submission: `counts` is False if the job existed already."""
+    """Result of a submission; `counts` is False if the job existed already."""
 
     counts: bool = True
 
@@ -128,11 +128,8 @@ class _Holder:
 
     def refusal(self, met: str, amount: int) -> QuotaError:
         if met == "grasps":
-            return QuotaError(
-                f"{self.words} has {amount} grasps in unfinished jobs, and at most {self.grasps} are allowed; "
-                "wait for a job to end, or request fewer grasps",
-                retry_after_s=60,
-            )
+            words = f"{self.words} has {amount} grasps in unfinished jobs, and at most {self.grasps} are allowed"
+            return QuotaError(f"{words}; wait for a job to end, or request fewer grasps", retry_after_s=60)
         if self.counts_jobs:
             words = f"{self.words} has submitted the {self.today} jobs allowed per day; more tomorrow (UTC)"
         else:
@@ -160,7 +157,7 @@ class Quotas:
 
     @contextmanager
     def claim(self, key: Key | None, job: str, grasps: int, *, is_new: bool = True) -> Iterator[SubmissionClaim]:
-        """Count the job that the context submits or retries (not `is_new`); undo the count if there is none."""
+        """Count the job that the context submits (`is_new`) or retries; raise QuotaError beyond a limit."""
         claim = SubmissionClaim()
         if key is None:
             yield claim
@@ -175,16 +172,13 @@ class Quotas:
         """Raise QuotaError if a project's GPU seconds of today are used up; its earlier jobs continue."""
         most = self._limits_of(project).gpu_seconds_per_day if project else None
         if most and (used := self._gpu_seconds(project, f"{datetime.now(UTC):%Y-%m-%d}")) >= most:
-            raise QuotaError(
-                f"the project {project!r} has used {used:.0f} of the {most} GPU seconds allowed per day; submit "
-                "more tomorrow (UTC)",
-                retry_after_s=_until_midnight(),
-            )
+            used_up = f"the project {project!r} has used {used:.0f} of the {most} GPU seconds allowed per day"
+            raise QuotaError(f"{used_up}; submit more tomorrow (UTC)", retry_after_s=_until_midnight())
 
     def _holders(self, key: Key) -> list[_Holder]:
-        own, all_ = key.limits, self._settings
-        grasps = all_.quota_grasps_in_flight if own.grasps_in_flight is None else own.grasps_in_flight
-        jobs = all_.quota_jobs_per_day if own.jobs_per_day is None else own.jobs_per_day
+        own, default = key.limits, self._settings
+        grasps = default.quota_grasps_in_flight if own.grasps_in_flight is None else own.grasps_in_flight
+        jobs = default.quota_jobs_per_day if own.jobs_per_day is None else own.jobs_per_day
         found = [_Holder(key.name, f"the key {key.name!r}", grasps, jobs, counts_jobs=True)]
         if key.project:
             limits = self._limits_of(key.project)
@@ -211,14 +205,14 @@ class Quotas:
                     self._connection.eval(_SETTLE, 1, holder.held_key, job, grasps, number)
                 else:
                     self._connection.eval(_UNDO, 1, holder.held_key, job, number)
-                # If two claims are for one job, only the claim that created it counts as a job of today.
+                # Of two claims for one job, only the claim that created the job counts as a job of today.
                 if today and met == "shared" and claim.counts:
                     self._connection.incrby(holder.day_key, today)
                 if today and met == "" and not claim.counts:
                     self._connection.decrby(holder.day_key, today)
 
     def _claim(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> str:
-        """Return `shared` (another claim is pending), `known`, `unknown` (no Redis), or empty (new job)."""
+        """Return `shared` (another claim is pending), `known`, `unknown` (no Redis), or "" for a new job."""
         met, amount = self._try_claim(holder, job, grasps, number, today)
         if met == "grasps":
             with self._log_outage(holder):
@@ -237,7 +231,7 @@ class Quotas:
         return met.decode(), int(amount)
 
     def _drop_ended(self, holder: _Holder) -> None:
-        """Drop ended jobs, but neither jobs whose submission is pending nor jobs claimed again meanwhile."""
+        """Drop the entries of ended jobs, except jobs whose submission is pending."""
         found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held_key)]
         entries = dict(zip(found[::2], found[1::2], strict=True))
         ended = sorted(entries.keys() - set(self._unfinished(list(entries))))
@@ -254,16 +248,14 @@ class Quotas:
 
 
 def _until_midnight() -> int:
-    now = datetime.now(UTC)
-    midnight = (now + timedelta(days=1)).replace(hour=0, minute=0, second=0, microsecond=0)
-    return int((midnight - now).total_seconds()) + 1
+    return int(86400 - datetime.now(UTC).timestamp() % 86400) + 1
 
 
 DATASET_PREFIX: Final = "dataset:"
 
 
 def select_unfinished(index: Index, ids: Collection[str]) -> set[str]:
-    """Return those of the given jobs and datasets (`dataset:NAME`) that have not ended."""
+    """Select ids of jobs and datasets (`dataset:NAME`) that have not ended."""
     names = {one.removeprefix(DATASET_PREFIX) for one in ids if one.startswith(DATASET_PREFIX)}
     found = index.jobs.unfinished([one for one in ids if not one.startswith(DATASET_PREFIX)])
     return found | {DATASET_PREFIX + name for name in index.datasets.unfinished(names)}
@@ -285,7 +277,7 @@ class Idempotency:
 
     @contextmanager
     def claim(self, owner: str, key: str, request: JobRequest) -> Iterator[None]:
-        """Bind `owner`'s idempotency key to the request that this context records; a failure releases the key."""
+        """Bind an owner's idempotency key to a request while the context runs; a failure releases the key."""
         name = f"graspd:idempotency:{digest_bytes(f'{owner} {key}'.encode())}"
         content = digest_json(request.model_dump(mode="json")).encode()
         is_ours = self._bind(name, content)

@@ -45,9 +45,8 @@ class Assets:
     def page(
         self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None, refused: bool = False
     ) -> Page[AssetView]:
-        return self._services.index.assets.page(
-            kind, limit=limit, cursor=cursor, refused=refused, scope=project_scope()
-        )
+        scope = project_scope()
+        return self._services.index.assets.page(kind, limit=limit, cursor=cursor, refused=refused, scope=scope)
 
     def one(self, kind: AssetKind, name: str) -> AssetView:
         return self._services.index.assets.get(kind, name, scope=project_scope())
@@ -56,7 +55,7 @@ class Assets:
         return library.load_asset_files(self._services.store, asset.kind, asset.digest)
 
     def model(self, asset: AssetView) -> bytes:
-        """Return the prepared hand or object as binary glTF; NotFoundError before its check."""
+        """Return the prepared hand or object as binary glTF; raise NotFoundError before its check."""
         return get_sealed(self._services.store, names.asset_model_key(asset.kind, asset.digest))
 
     def add(
@@ -71,8 +70,8 @@ class Assets:
     ) -> AssetView:
         """Store an upload. Workers check hands and objects; a network is checked here.
 
-        With `self_test` the check of a hand includes grasps. All projects may use `shared` assets. With `rename` the
-        asset gets the next free name if its name is taken; content that exists already keeps its name.
+        With `self_test`, the check of a hand includes grasps. All projects may use a `shared` asset. With `rename`, the
+        asset gets the next free name if its name is taken, and existing content keeps its name.
         """
         found = network_report(files, name) if kind is AssetKind.NETWORK else None
         project = project_scope().project
@@ -99,11 +98,11 @@ class Assets:
         return self.one(kind, asset.digest)
 
     def hand_facts(self, asset: AssetView) -> HandFacts:
-        """Return the facts and guesses about a hand; ConflictError if an older version made its model."""
+        """Return facts and guesses about a hand; raise ConflictError if an older version made its model."""
         return facts_of(self.model(asset))
 
     def correct(self, name: str, corrections: HandCorrections, new_name: str = "") -> AssetView:
-        """Create a hand from the same files with corrected facts; the default name adds a number."""
+        """Create a hand from the same files with corrected facts; by default its name gets a number."""
         hand = self.one(AssetKind.HAND, name)
         facts = self.hand_facts(hand)
         archive = self._services.store.get(names.asset_files_key(AssetKind.HAND, hand.digest))
@@ -145,8 +144,8 @@ class Assets:
         if not project:
             return digest
         known = self._find(kind, digest)
+        # Identical files that are shared already are not stored a second time.
         if known and known.name == name and (known.shared or known.builtin):
-            # The identical files are shared already: do not create a second asset.
             return digest
         files.update(project_mark(files, project))
         return digest_files(kind, files)
@@ -158,10 +157,8 @@ class Assets:
             return None
 
     def _holder(self, kind: AssetKind, name: str) -> str:
-        """Return the digest that a name refers to; empty if the name is free."""
-        # Names of other projects do not count here, not even for an admin.
+        """Return the digest that a name refers to; empty if only other projects or refused uploads have it."""
         known = self._find(kind, name, replace(project_scope(), everything=False))
-        # A refused upload does not occupy its name: a fixed file may use it.
         return known.digest if known and known.verdict != "refuse" else ""
 
     def _check_name(self, kind: AssetKind, name: str, digest: str) -> None:

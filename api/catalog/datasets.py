@@ -1,6 +1,6 @@
 """Datasets, named sets of objects, and comparison of two datasets.
 
-Until it ends, a dataset counts against its key's quota as one job with all its grasps. Only its owner may change it.
+Until it ends, a dataset counts against its key's quota as one job with all its grasps.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Datasets:
     def cells(
         self, name: str, *, state: State | None = None, limit: int = 50, cursor: str | None = None
     ) -> Page[CellView]:
-        """Return each cell (hand x object) of a dataset with its job, ordered by hand."""
+        """Return cells (hand x object) of a dataset with their jobs, ordered by hand."""
         return self._services.index.datasets.cells(name, state=state, limit=limit, cursor=cursor, scope=project_scope())
 
     def all_cells(self, name: str) -> Iterator[CellView]:
@@ -89,7 +89,7 @@ class Datasets:
         return self._services.index.overview.matrix(scope=project_scope())
 
     def take_snapshot(self, name: str) -> tuple[Snapshot, bool]:
-        """Record the dataset's present shards; return the snapshot and whether it is new."""
+        """Record the dataset's present shards; return the snapshot, and whether it is new."""
         self.one(name)
         return actions.take_snapshot(self._services, name)
 
@@ -119,9 +119,7 @@ class Datasets:
 
     def compare(self, one: str, other: str) -> Comparison:
         both = self.one(one), self.one(other)
-        filters = [
-            GraspFilter(dataset=each.name, valid=True if each.options.standing == "valid" else None) for each in both
-        ]
+        filters = [GraspFilter(dataset=each.name, valid=each.options.standing == "valid" or None) for each in both]
         metrics = self._services.index.statistics.compare_distributions(filters, MEAN_METRICS)
         few = max(each.cells for each in both) <= MOST_CELLS
         return Comparison(*both, list(_settings(*both)), self._pairs(one, other) if few else [], metrics)
@@ -154,9 +152,8 @@ class Pair:
     @property
     def gain(self) -> float | None:
         """Yield of the other dataset minus yield of this one, if both have candidates."""
-        if self.one is None or self.other is None or None in (self.one.valid_yield, self.other.valid_yield):
-            return None
-        return (self.other.valid_yield or 0.0) - (self.one.valid_yield or 0.0)
+        before, after = (None if cell is None else cell.valid_yield for cell in (self.one, self.other))
+        return None if before is None or after is None else after - before
 
 
 @dataclass(frozen=True)
@@ -168,11 +165,11 @@ class Comparison:
     pairs: list[Pair]
     """Ordered by hand; empty if a dataset has more than `MOST_CELLS` cells."""
     metrics: dict[Metric, list[Distribution | None]]
-    """Distributions, in the same bins, over valid grasps if a dataset requests these, else over all its grasps."""
+    """Distributions of both datasets in the same bins, each over its valid grasps if it requests these, else all."""
 
 
 def _settings(one: DatasetView, other: DatasetView) -> Iterator[tuple[str, str, str]]:
-    """Yield options that differ; then hands and objects that only one dataset has."""
+    """Yield options that differ, with both values; then hands and objects that only one dataset has."""
     said = [each.options.model_dump(mode="json") for each in (one, other)]
     for name in said[0]:
         if said[0][name] != said[1][name]:

@@ -33,7 +33,7 @@ _ENDS_AT_ONCE: Final = 100
 
 
 async def job_events(jobs: Jobs, job_id: str, request: Request) -> AsyncIterator[ServerSentEvent]:
-    """Send `progress` with the job at each change; `end` when its state is final."""
+    """Send `progress` with the job at each change, and `end` when its state is final."""
     last = ""
     while not await request.is_disconnected() and is_still_authorized(request, Scope.READ):
         try:
@@ -54,6 +54,7 @@ async def job_events(jobs: Jobs, job_id: str, request: Request) -> AsyncIterator
 
 
 async def ends(webhooks: Webhooks, since: int, request: Request) -> AsyncIterator[ServerSentEvent]:
+    """Send `end` for each job or dataset that ended after number `since`."""
     while not await request.is_disconnected() and is_still_authorized(request, Scope.READ):
         try:
             found = await run_sync(partial(webhooks.ends, since, limit=_ENDS_AT_ONCE))
@@ -69,7 +70,7 @@ async def ends(webhooks: Webhooks, since: int, request: Request) -> AsyncIterato
 
 
 async def service_events(overview: Overview, request: Request) -> AsyncIterator[ServerSentEvent]:
-    """Send `progress` without content when a job, task or worker changed: the home page then reloads."""
+    """Send `progress` without content when a job, task or worker changed."""
     last = ""
     while not await request.is_disconnected() and is_still_authorized(request, Scope.READ):
         try:
@@ -94,15 +95,9 @@ class Webhooks:
         master = self._services.settings.webhook_secret
         if master is None:
             raise ConflictError("webhooks are off; the operator can set GRASPD_WEBHOOK_SECRET for API and controller")
-        project = project_scope().project
-        hook = Webhook(
-            id=secrets.token_hex(16),
-            url=check_url(url),
-            states=tuple(dict.fromkeys(states)),
-            created=timestamp(),
-            owner=caller_id(),
-            project=project,
-        )
+        project, states = project_scope().project, tuple(dict.fromkeys(states))
+        about = {"created": timestamp(), "owner": caller_id(), "project": project}
+        hook = Webhook(id=secrets.token_hex(16), url=check_url(url), states=states, **about)
         with record_transaction(self._services) as (connection, put):
             if len(self._services.index.outbox.webhooks(scope=ProjectScope(project, everything=False))) >= MOST_HOOKS:
                 raise LimitError(f"there are {MOST_HOOKS} webhooks already, the maximum; delete one")
@@ -113,7 +108,7 @@ class Webhooks:
         return self._services.index.outbox.webhook(hook.id), secret_of(master.get_secret_value(), hook.id)
 
     def all(self) -> list[WebhookView]:
-        """Return webhooks that the caller may change; addresses of other webhooks may contain credentials."""
+        """Return only webhooks that the caller may change, because their addresses may contain credentials."""
         hooks = self._services.index.outbox.webhooks(scope=project_scope())
         return [hook for hook in hooks if may_change(hook.owner, hook.project)]
 
@@ -122,7 +117,7 @@ class Webhooks:
 
     def delete(self, webhook: str) -> None:
         hook = self._owned(webhook)
-        # Delete the record first: an interrupted deletion then leaves only a row that a rebuild drops.
+        # The record goes first: an interrupted deletion then leaves only a row, which a rebuild drops.
         self._services.store.delete(names.webhook_key(hook.id))
         self._services.index.outbox.remove(hook.id)
         log.info("webhook %s deleted", hook.id)

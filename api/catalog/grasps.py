@@ -1,7 +1,4 @@
-"""Grasps: search by metrics, distributions of a job, and details of one grasp from its base shard.
-
-Details: postures, metrics at every threshold, verdict for each push, scene, and trajectory (approach, grasp, lift).
-"""
+"""Grasps: search by metrics, distributions of a job, and details of one grasp from its base shard."""
 
 from __future__ import annotations
 
@@ -56,14 +53,14 @@ class Grasps:
         return self._index.grasps.page(self._filter(query), sort=sort, limit=limit, cursor=cursor)
 
     def members(self, query: models.GraspQuery) -> list[Grasp]:
-        """Return identifiers of all grasps that pass every filter; LimitError if they are too many."""
+        """Return identifiers of all grasps that pass every filter; raise LimitError beyond MOST_TAGGED."""
         found = self._index.grasps.members(self._filter(query), limit=MOST_TAGGED + 1)
         if len(found) > MOST_TAGGED:
             raise LimitError(f"more than {MOST_TAGGED} grasps pass this filter, the maximum of a selection; narrow it")
         return found
 
     def get_many(self, places: Sequence[Grasp]) -> Iterator[GraspView]:
-        """Yield grasps by identifier; all must be visible to the caller, and deleted grasps are omitted."""
+        """Yield grasps by identifier, without deleted ones; the caller must have access to all of them."""
         return self._index.grasps.get_many(places)
 
     def _filter(self, query: models.GraspQuery) -> GraspFilter:
@@ -81,11 +78,12 @@ class Grasps:
     def one(self, shard_id: str, row: int) -> models.GraspDetail:
         grasp, shard = self._index.grasps.get(shard_id, row, scope=project_scope()), self._index.shards.get(shard_id)
         file = self._shard(shard.key, shard.sha256)
+        names = file.attributes.get("joint_names")
         return models.GraspDetail(
             **grasp.model_dump(),
             hand_digest=shard.hand_digest,
             object_digest=shard.object_digest,
-            joint_names=_texts(file.attributes.get("joint_names")),
+            joint_names=names if isinstance(names, list) else [],
             postures={name: _posture(file, name, row) for name in _POSTURES},
             thresholds_m=_numbers(file["quality/thresholds_m"]),
             sweep={
@@ -195,10 +193,6 @@ def _number(value: Any) -> float | None:
     return None if value is None or not math.isfinite(float(value)) else float(value)
 
 
-def _texts(value: Any) -> list[str]:
-    return [str(name) for name in value] if isinstance(value, list) else []
-
-
 def _trajectory(file: Shard, row: int) -> list[models.Waypoint]:
     points = trajectory_of(file, row)
     return [
@@ -238,7 +232,5 @@ def _neighbours(file: Shard, number: int) -> list[models.Neighbour]:
     names, digests = (file.attributes.get(key) for key in ("neighbours", "neighbour_digests"))
     poses = file["scene/neighbour_pose"][number].tolist()
     known = zip_longest(names if isinstance(names, list) else [], digests if isinstance(digests, list) else [])
-    return [
-        models.Neighbour(name=str(name), digest=str(digest), pose=pose)
-        for (name, digest), pose in zip(known, poses, strict=False)
-    ]
+    pairs = zip(known, poses, strict=False)
+    return [models.Neighbour(name=str(name), digest=str(digest), pose=pose) for (name, digest), pose in pairs]

@@ -53,7 +53,7 @@ class Shards:
         return _shard(self._services.index.shards.get(shard_id, scope=project_scope()))
 
     def get_intact(self, shard_id: str) -> Shard:
-        """Return a shard whose file matches its checksum; a file is read again only after a change."""
+        """Return a shard, and check its file against its checksum if the file changed since the last check."""
         shard = self.one(shard_id)
         self._checked.check(shard.key, shard.sha256)
         return shard
@@ -105,8 +105,7 @@ class Jobs:
                 job, is_new = job_actions.enter_job(self._services, record)
                 claim.counts = is_new
                 log.info("job submitted" if is_new else "job existed already")
-        # The identical job may have been requested with a named fidelity. A request with a target still gets the
-        # choice made for it.
+        # An identical job may exist with a named fidelity; the response has the choice made for this request.
         return self._detail(job).model_copy(update={"choice": record.choice or job.choice})
 
     def cancel(self, job_id: str) -> JobDetail:
@@ -200,10 +199,7 @@ _KEPT_TASKS: Final = 4096
 
 
 class TaskRates:
-    """Rates of running tasks, from the first and the latest observation of each.
-
-    The observations are a cache of this process; without them the rates are unknown for about a second.
-    """
+    """Rates of running tasks, from the first and the latest observation of each in this process."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -254,7 +250,7 @@ def _status(stage: StageProgress, tasks: list[TaskView], paces: TaskRates) -> St
 
 
 def _rate(stage: StageProgress, running: list[TaskView], paces: TaskRates) -> float | None:
-    """Return tasks per second of running tasks; of finished tasks if those rates are unknown."""
+    """Return tasks per second of the running tasks; if unknown, the mean rate of the finished tasks."""
     known = [pace for task in running if (pace := paces.of(task)) is not None]
     if known:
         return sum(known) * len(running) / len(known)

@@ -45,7 +45,7 @@ _DAMAGE_SHOWN: Final = 5
 _FAILURES_SHOWN: Final = 4
 MINUTES: Final = 60
 _JOBS_WATCHED: Final = 20
-#: Least time between two computations of the fingerprint [s], for any number of open pages.
+#: Least time between two computations of a fingerprint [s].
 FINGERPRINT_S: Final = 1.0
 
 
@@ -62,23 +62,23 @@ class Overview:
     def workers(self) -> list[Worker]:
         """Return workers, live ones first, each with its present stage and the time since its heartbeat."""
         known = self._services.index.overview.workers()
-        doing = self._services.index.feed.outputs([worker.task_id for worker in known if worker.task_id])
-        seen = self._tasks_in_scope(worker.task_id for worker in known if worker.task_id)
+        tasks = [worker.task_id for worker in known if worker.task_id]
+        outputs, visible = self._services.index.feed.outputs(tasks), self._tasks_in_scope(tasks)
         try:
-            pulses = self._queue_status().workers
+            heartbeats = self._queue_status().workers
         except UnavailableError:
-            pulses = {}
+            heartbeats = {}
         return [
             Worker(
-                **worker.model_dump() | ({} if worker.task_id in seen else {"task_id": None}),
-                stage=Stage(doing[worker.task_id][0]) if worker.task_id in doing else None,
-                lease_age_s=round(pulses[worker.name][1], 3) if worker.name in pulses else None,
+                **worker.model_dump() | ({} if worker.task_id in visible else {"task_id": None}),
+                stage=Stage(outputs[worker.task_id][0]) if worker.task_id in outputs else None,
+                lease_age_s=round(heartbeats[worker.name][1], 3) if worker.name in heartbeats else None,
             )
             for worker in known
         ]
 
     def task_of(self, worker: Worker) -> TaskView | None:
-        """Return a worker's task; None without one, and for the check of an upload (no task in the index)."""
+        """Return a worker's task; None if it has none, or checks an upload (no task in the index)."""
         if worker.state != "busy" or not worker.task_id:
             return None
         try:
@@ -106,7 +106,7 @@ class Overview:
         return self._probes.health()
 
     def damage(self) -> tuple[int, list[Damage]]:
-        """Return the number of damaged or missing stored objects, and the first ones; none in a limited scope."""
+        """Return the number of damaged or missing stored objects, and the first ones; none without `admin`."""
         if not project_scope().everything:
             return 0, []
         return self._services.index.damage.summary(limit=_DAMAGE_SHOWN)
@@ -124,20 +124,18 @@ class Overview:
         return found
 
     def fingerprint(self) -> str:
-        """Return a text that differs after each change of a worker, or of a job or task in scope."""
+        """Return a text that changes with each worker, and with each job and task in scope."""
         with self._lock:
             at, digest = self._fingerprints.get(project_scope(), (0.0, ""))
             now = time.monotonic()
             if not digest or now - at >= FINGERPRINT_S:
-                digest = self._digest()
+                workers = [(worker.name, worker.state, worker.task_id) for worker in self.workers()]
+                page = self._jobs.page(limit=_JOBS_WATCHED)
+                jobs = [(job.id, job.state, round(job.progress, 3)) for job in page.items]
+                stats = self.stats().model_dump(mode="json")
+                digest = digest_json({"stats": stats, "workers": workers, "jobs": jobs})
                 self._fingerprints[project_scope()] = (now, digest)
             return digest
-
-    def _digest(self) -> str:
-        jobs = self._jobs.page(limit=_JOBS_WATCHED).items
-        workers = [(worker.name, worker.state, worker.task_id) for worker in self.workers()]
-        moving = [(job.id, job.state, round(job.progress, 3)) for job in jobs]
-        return digest_json({"stats": self.stats().model_dump(mode="json"), "workers": workers, "jobs": moving})
 
     def _tasks_in_scope(self, tasks: Iterable[str]) -> set[str]:
         """Return the tasks that are in scope or belong to no job, such as checks of uploads."""
@@ -155,14 +153,14 @@ _INCOMPLETE: Final = "the controller is rebuilding the index from the store; unt
 
 
 class Probes:
-    """Probes of Redis, index and store, in parallel threads; a hanging probe is not started again."""
+    """Probes of Redis, index and store in parallel threads; a probe that hangs is not started again."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
         self._known: tuple[float, Health] | None = None
         self._hanging: dict[str, _Probe] = {}
+        #: Service to which Redis belonged at the last probe.
         self._service: str | None = None
-        """Service to which Redis belonged at the last probe."""
         self._lock = threading.Lock()
 
     def health(self) -> Health:
@@ -174,11 +172,7 @@ class Probes:
             return self._known[1]
 
     def _probe_all(self) -> Health:
-        questions: dict[str, Callable[[], Part]] = {
-            "redis": self._redis,
-            "index": self._index,
-            "store": lambda: _healthy_part(self._services.store.probe()),
-        }
+        questions = {"redis": self._redis, "index": self._index, "store": self._store}
         probes = {name: self._hanging.get(name) or _Probe(name, question) for name, question in questions.items()}
         deadline = time.monotonic() + PATIENCE_S
         parts = {name: probe.part(deadline) for name, probe in probes.items()}
@@ -187,7 +181,7 @@ class Probes:
         return Health(ok=all(part.ok for part in parts.values()), parts=parts, controller=controller, workers=workers)
 
     def _redis(self) -> Part:
-        """Probe Redis; a Redis of another service is not ready, because that service ignores jobs of this one."""
+        """Probe Redis; a Redis of another service is not ready."""
         part, service = _healthy_part(self._services.queue.ping()), self._services.queue.service()
         if service != self._service:
             try:
@@ -200,18 +194,17 @@ class Probes:
         return part
 
     def _index(self) -> Part:
-        """Probe the index; an incomplete index is not ready, because jobs would appear to be missing."""
+        """Probe the index; an incomplete index is not ready."""
         part, made = _healthy_part(self._services.index.database.ping()), self._services.index.notes.completeness()
         if made is None:
             return part.model_copy(update={"ok": False, "detail": _INCOMPLETE})
         if made.left_out:
-            some = ", ".join(made.names[:3])
-            detail = (
-                f"{made.left_out} damaged records of the store are not in the index: {some}; run "
-                "`graspd admin store verify`"
-            )
-            return part.model_copy(update={"detail": detail})
+            detail = f"{made.left_out} damaged records of the store are not in the index: {', '.join(made.names[:3])}"
+            return part.model_copy(update={"detail": f"{detail}; run `graspd admin store verify`"})
         return part
+
+    def _store(self) -> Part:
+        return _healthy_part(self._services.store.probe())
 
     def _controller_and_workers(self) -> tuple[bool, int]:
         try:
@@ -233,17 +226,15 @@ class _Probe:
         self.thread.start()
 
     def part(self, deadline: float) -> Part:
-        start = time.monotonic()
-        self.thread.join(max(0.0, deadline - start))
+        self.thread.join(max(0.0, deadline - time.monotonic()))
         return self._part or Part(ok=False, detail="no answer in time; see the log of this part")
 
     def _run(self) -> None:
         try:
             self._part = self._question()
-        except GraspdError as error:
-            self._part = Part(ok=False, detail=str(error))
         except Exception as error:
-            self._part = Part(ok=False, detail=f"{type(error).__name__}: {error}")
+            name = "" if isinstance(error, GraspdError) else f"{type(error).__name__}: "
+            self._part = Part(ok=False, detail=f"{name}{error}")
 
 
 DAYS: Final = 31
@@ -252,14 +243,14 @@ _COLUMNS: Final = tuple(UsageDay.model_fields)
 
 
 class Usage:
-    """Usage in the caller's scope: the key's project, or all projects with `admin`."""
+    """Usage of the projects in the caller's scope."""
 
     def __init__(self, services: Services, keys: KeyFile) -> None:
         self._services = services
         self._keys = keys
 
     def days(self, since: date | None = None, until: date | None = None) -> list[UsageDay]:
-        """Return the usage of each project on each day, newest first; by default of the last month."""
+        """Return the usage of each project on each day, newest first; by default of the last 31 days."""
         last = until or datetime.now(UTC).date()
         first = since or last - timedelta(days=min(DAYS - 1, last.toordinal() - 1))
         if first > last:
@@ -283,7 +274,7 @@ def as_csv(days: list[UsageDay]) -> str:
 
 
 class DeletionView(View):
-    """Resource that was deleted within the grace time."""
+    """Deleted resource that can be restored."""
 
     what: What
     id: str = Field(description="id of the job, tag, hand, object or network; name of the dataset")
@@ -314,8 +305,8 @@ class Deletions:
     def _view(self, one: Deletion) -> DeletionView:
         ends = datetime.fromisoformat(one.at) + timedelta(seconds=self._services.settings.shard_grace_s)
         until = ends.isoformat(timespec="seconds").replace("+00:00", "Z")
-        said = {"name": one.name or one.id, "owner": one.submitter}
-        return DeletionView(what=one.what, id=one.id, at=one.at, until=until, project=one.project, **said)
+        whose = {"owner": one.submitter, "project": one.project}
+        return DeletionView(what=one.what, id=one.id, name=one.name or one.id, at=one.at, until=until, **whose)
 
 
 def _is_in_scope(one: Deletion) -> bool:

@@ -9,6 +9,7 @@ import logging
 import zipfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import PurePosixPath
 from tempfile import TemporaryFile
 from typing import IO, Any, Final, Literal
@@ -49,7 +50,7 @@ class Tags:
         return self._services.index.tags.of(grasps, scope=project_scope())
 
     def chosen(self, selection: Selection) -> list[Grasp]:
-        """Return the grasps of a selection, each once, by shard and row; NotFoundError if one is out of scope."""
+        """Return the grasps of a selection, each once; raise NotFoundError if one is out of scope."""
         if selection.filter is not None:
             return self._grasps.members(selection.filter)
         named = sorted({(grasp.shard_id, grasp.row) for grasp in selection.grasps or ()})
@@ -96,7 +97,7 @@ def _permit(tag: Tag | None) -> None:
 
 Format = Literal["csv", "json", "zip"]
 MEDIA_TYPES: Final[dict[Format, str]] = {"csv": "text/csv", "json": "application/json", "zip": "application/zip"}
-#: Most shards per ZIP: about ten seconds of work.
+#: Maximum number of shards per ZIP: about ten seconds of work.
 MOST_SHARDS: Final = 2000
 _CHUNK: Final = 1 << 20
 _COLUMNS: Final = (*GraspView.model_fields, "tags")
@@ -131,9 +132,7 @@ class GraspExports:
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
         rows = csv.DictWriter(text, _COLUMNS)
         rows.writeheader()
-        for row in self._rows(places):
-            rows.writerow(row | {"tags": " ".join(row["tags"])})
-        text.flush()
+        rows.writerows(row | {"tags": " ".join(row["tags"])} for row in self._rows(places))
         text.detach()
 
     def _json(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
@@ -147,28 +146,24 @@ class GraspExports:
         if not shards:
             raise InputError("the selection contains no grasp; change it")
         if len(shards) > MOST_SHARDS:
-            raise LimitError(
-                f"these grasps are in {len(shards)} shards, and a ZIP has at most {MOST_SHARDS}; select "
-                "fewer, or write them with `graspd grasps where` on a machine that can read the store"
-            )
+            fix = "select fewer, or write them with `graspd grasps where` on a machine that can read the store"
+            raise LimitError(f"these grasps are in {len(shards)} shards, and a ZIP has at most {MOST_SHARDS}; {fix}")
         looked_at, names = 0, list[PurePosixPath]()
         with zipfile.ZipFile(file, "w") as packed:
             for shard_id, rows in shards.items():
                 known = self._services.index.shards.get(shard_id, scope=project_scope())
-                shard = read_shard(
-                    read_checked(self._services.store, known.key, known.sha256), kind="base", name=known.key
-                )
+                data = read_checked(self._services.store, known.key, known.sha256)
+                shard = read_shard(data, kind="base", name=known.key)
                 mask = np.zeros(known.count, bool)
                 mask[list(rows)] = True
                 looked_at += len(mask)
                 names.append(relative_path_of(shard, names))
                 # ZipInfo has a fixed date, so that the same grasps give an identical file.
                 packed.writestr(zipfile.ZipInfo(str(names[-1])), part_of_shard(shard, mask))
-            told = {**said, "looked_at": looked_at, "kept": len(set(places)), "shards": [str(name) for name in names]}
-            packed.writestr(zipfile.ZipInfo("subset.json"), json.dumps(told, indent=1) + "\n")
+            facts = {**said, "looked_at": looked_at, "kept": len(set(places)), "shards": [*map(str, names)]}
+            packed.writestr(zipfile.ZipInfo("subset.json"), json.dumps(facts, indent=1) + "\n")
 
 
 def _stream(file: IO[bytes]) -> Iterator[bytes]:
     with closing(file):
-        while chunk := file.read(_CHUNK):
-            yield chunk
+        yield from iter(partial(file.read, _CHUNK), b"")

@@ -29,15 +29,14 @@ from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 
 PAGE_SIZE: Final = 20
-#: Most cells of a matrix that is shown as a table; a larger matrix is a paginated list.
+#: Maximum number of cells of a matrix that is shown as a table; a larger matrix is a paginated list.
 MATRIX_CELLS: Final = 1000
 _CELLS_AT_ONCE: Final = 200
 Fields = Annotated[FormData, fields_of(4000)]
 _DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled", "snapshot": "taken as a snapshot"}
 
-_MAKE: Final = {"name": "", "grasps": "320", "fidelity": "standard"} | {
-    one.name: one.default for one in inputs_of(cells=True)
-}
+_INPUTS: Final = inputs_of(cells=True)
+_MAKE: Final = {"name": "", "grasps": "320", "fidelity": "standard"} | {one.name: one.default for one in _INPUTS}
 
 router = APIRouter(prefix="/datasets", include_in_schema=False)
 
@@ -56,9 +55,9 @@ def datasets_page(
 def create(request: Request, datasets: DatasetsOf, assets: AssetsOf, fields: Fields) -> HTMLResponse | RedirectResponse:
     form = {key: str(fields[key]) for key in _MAKE if fields.get(key)}
     wanted = form | {"hands": fields.getlist("hands"), "objects": fields.getlist("objects")}
-    beside = {"neighbours": split_list(form.get("neighbours", ""))}
+    neighbours = split_list(form.get("neighbours", ""))
     try:
-        dataset = datasets.create(DatasetRequest.model_validate(wanted | beside))
+        dataset = datasets.create(DatasetRequest.model_validate(wanted | {"neighbours": neighbours}))
     except (ValidationError, InputError) as error:
         return _overview(request, datasets, assets, problem=first_message(error), form=wanted, status=422)
     return RedirectResponse(f"/datasets/{dataset.name}", status_code=303)
@@ -120,11 +119,8 @@ def act_on_cells(name: str, jobs: JobsOf, fields: Fields) -> RedirectResponse:
 
 @router.post("/{name}/{action}", dependencies=SUBMIT)
 def act(name: str, action: str, datasets: DatasetsOf) -> RedirectResponse:
-    do: dict[str, Callable[[str], Any]] = {
-        "cancel": datasets.cancel,
-        "retry": datasets.retry,
-        "snapshot": datasets.take_snapshot,
-    }
+    do: dict[str, Callable[[str], Any]]
+    do = {"cancel": datasets.cancel, "retry": datasets.retry, "snapshot": datasets.take_snapshot}
     if action not in do:
         raise InputError(f"a dataset has no action {action!r}; there are: {', '.join(do)}")
     do[action](name)
@@ -149,7 +145,7 @@ def _jobs_of(jobs: Jobs, pairs: Iterable[tuple[str, str]], action: str) -> list[
 
 
 def _apply_to_each(do: Callable[[Any], Any], wanted: Iterable[Any]) -> tuple[int, int]:
-    """Apply an action; return the numbers of successes, and of refusals because of owner or state."""
+    """Apply an action; return the numbers of successes and of refusals (because of owner or state)."""
     done = left = 0
     for one in wanted:
         try:
@@ -201,7 +197,7 @@ def _overview(
         hands=hands,
         objects=objects,
         fidelities=OFFERED,
-        inputs=inputs_of(cells=True),
+        inputs=_INPUTS,
         form=_MAKE | {"hands": [], "objects": []} | (form or {}),
         problem=problem,
         did=_action_summary(request),

@@ -23,7 +23,7 @@ HEIGHT: Final = 160.0
 
 @dataclass(frozen=True)
 class Plot:
-    """Bars: SVG points for display without scripts, and numbers for the script."""
+    """Plot of bars: SVG points for display without scripts, and numbers for the script."""
 
     label: str
     points: str
@@ -57,7 +57,7 @@ def minute_plot(values: Sequence[int], start: float) -> Plot:
 
 
 def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
-    """Return a histogram's bars; each links to the page `path` of grasps in its range that match `where`."""
+    """Return a histogram's bars; each links to page `path` with the grasps in its range that match `where`."""
     width, top = (histogram.high - histogram.low) / len(histogram.counts), max(histogram.counts) or 1
     made = []
     for index, number in enumerate(histogram.counts):
@@ -92,7 +92,7 @@ def paired_bars(both: Sequence[Distribution | None]) -> list[PairedBar]:
 
 #: Steps of the colour scale; the style sheet has a class for each.
 STEPS: Final = 10
-#: Most objects on a page; objects with jobs come first.
+#: Maximum number of objects on a page; objects with jobs come first.
 _ROWS: Final = 60
 
 
@@ -100,8 +100,7 @@ _ROWS: Final = 60
 class Tile:
     """Cell of the matrix: one hand on one object.
 
-    `made` counts grasps of status `standing`; `share` is the valid share of validated candidates. The checkbox sends
-    `value`; the link is `href`.
+    `made`: number of grasps of kind `standing`; `share`: yield; `value`: value of the checkbox.
     """
 
     hand: str
@@ -153,13 +152,14 @@ def dataset_grid(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
 
 
 def service_grid(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Sequence[str]) -> Grid:
+    """Return the matrix of all jobs, with a blank tile for each pair without a job."""
     found = {
         (cell.hand, cell.object): Tile(
             hand=cell.hand,
             object=cell.object,
             value=f"{cell.hand}|{cell.object}",
             href=f"/grasps?hand={cell.hand}&object={cell.object}",
-            state=_state(cell),
+            state=next((name for name in ("running", "queued", "failed") if getattr(cell, name)), "succeeded"),
             made=cell.valid if cell.validated else cell.grasps,
             candidates=cell.candidates,
             share=cell.valid_yield,
@@ -169,9 +169,8 @@ def service_grid(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Seq
         for cell in cells
     }
     columns = list(dict.fromkeys([*hands, *(hand for hand, _ in found)]))
-    names = list(dict.fromkeys([*objects, *(obj for _, obj in found)]))
     worked = {obj for _, obj in found}
-    ordered = sorted(names, key=lambda name: (name not in worked, name))
+    ordered = sorted({*objects, *worked}, key=lambda name: (name not in worked, name))
     for hand in columns:
         for obj in ordered[:_ROWS]:
             found.setdefault((hand, obj), Tile(hand, obj, f"{hand}|{obj}", "", "blank", 0, 0, None))
@@ -182,11 +181,7 @@ def _grid(hands: Sequence[str], objects: Sequence[str], found: dict[tuple[str, s
     return Grid(list(hands), [(obj, [found.get((hand, obj)) for hand in hands]) for obj in objects], hidden)
 
 
-def _state(cell: MatrixCell) -> str:
-    return next((state for state in ("running", "queued", "failed") if getattr(cell, state)), "succeeded")
-
-
-#: Width and height of a cell with its gap [px], as in the style sheet; the lines over the cells depend on it.
+#: Width and height of a cell with its gap [px], as in the style sheet.
 PITCH: Final = (40, 30)
 
 
@@ -236,6 +231,7 @@ class MapDrawing:
 
 
 def load_stability(store: Store) -> studies.Stability | None:
+    """Load the newest published stability maps; None if there are none, or they are unreadable."""
     try:
         found = latest_record(store, STABILITY)
         return None if found is None else studies.from_json(found)
@@ -258,7 +254,7 @@ def _panel(one: studies.StabilityMap, name: str) -> Panel:
     squares = {(cell.x, cell.y): _square(one, cell, ringed=one.is_divided and cell.reached) for cell in cells}
     line = one.lines.get(name, [])
     if any(isinstance(x, str) for x in xs):
-        # Texts fit better before a row than below a narrow column.
+        # Texts are labels of rows, because columns are narrow.
         rows = [(studies.format_tick(x), [squares.get((x, y)) for y in ys]) for x in xs]
         return Panel(name, one.y, one.x, [studies.format_tick(y) for y in ys], rows, "")
     upward = ys if all(isinstance(y, str) for y in ys) else ys[::-1]

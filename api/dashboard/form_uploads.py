@@ -1,8 +1,7 @@
 """Hand and object of a job's form: a known asset, or an uploaded file.
 
-The form shows exactly what the job will use. A refused file stays in the store, and the form refers to it: the next
-submission checks it again with the form's options. Each fix suggested by a refusal is a button, so no fix
-needs the command line.
+A refused file stays in the store, and the form refers to it: the next submission checks it again with the form's
+options. Each fix that a refusal suggests is a button.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class Fix:
     """Button that checks a refused file again."""
 
     value: str
-    """Keys of `asset.json` that the button sets, as JSON; null means the value of the field next to the button."""
+    """Keys of `asset.json` that the button sets, as JSON; null stands for the value of the field next to the button."""
     words: str
     asks: str = ""
     """Key whose value is in the field next to the button; empty if there is no field."""
@@ -75,7 +74,7 @@ class AssetChoice:
 
 
 def choose_asset(request: Request, assets: Assets, fields: FormData, kind: AssetKind) -> AssetChoice:
-    """Return the hand or object of a submitted form: a new file, a known asset, or the refused file."""
+    """Return the hand or object of a submitted form: an uploaded file, a known asset, or the refused file."""
     file, known = fields.get(FILE_FIELDS[kind]), _text(fields, kind.value)
     if isinstance(file, UploadFile) and file.filename:
         try:
@@ -102,9 +101,7 @@ def refusal_of(asset: AssetView) -> Refusal:
         for unit in _entries(facts, "units_suggested")
         if isinstance(unit, str) and (words := dict(UNITS).get(unit))
     ]
-    others = [
-        fix for one in _entries(facts, "options_suggested") if isinstance(one, dict) and (fix := _fix(one)) is not None
-    ]
+    others = [fix for one in _entries(facts, "options_suggested") if isinstance(one, dict) and (fix := _fix(one))]
     return Refusal(str(facts.get("problem") or asset.message or "refused"), (*units, *others))
 
 
@@ -119,7 +116,7 @@ def _length(lengths: Any, unit: str) -> str:
 
 
 def _fix(options: dict[str, Any]) -> Fix | None:
-    """Return the button of suggested options; None if this form cannot express them."""
+    """Return the button for suggested options; None if the form has none for them."""
     ((key, value),) = options.items() if len(options) == 1 else (("", None),)
     if key in _ASKED and value is None:
         label, attributes, words = _ASKED[key]
@@ -142,7 +139,7 @@ def _store(request: Request, assets: Assets, kind: AssetKind, file: UploadFile, 
 
 
 def _retry_upload(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
-    """Store the refused file again, with the form's units or with the options of the pressed button."""
+    """Store the refused file again, with the options of the pressed button or with changed units."""
     before, said = assets.one(kind, digest), fix_options(fields, kind)
     if not said and kind is AssetKind.OBJECT and (units := _units(fields)) != _text(fields, "held_units"):
         said = {"units": units}
@@ -171,7 +168,7 @@ def fix_options(fields: FormData, kind: AssetKind) -> dict[str, Any]:
 
 
 def _wait_for_check(assets: Assets, asset: AssetView) -> AssetChoice:
-    """Wait briefly for the check of an upload, so that one press of the button suffices."""
+    """Wait at most 15 s for the check of an upload; without a result, choose the unchecked asset."""
     deadline = time.monotonic() + _CHECK_WAIT_S
     while asset.verdict is None and time.monotonic() < deadline:
         time.sleep(0.2)
@@ -182,7 +179,7 @@ def _wait_for_check(assets: Assets, asset: AssetView) -> AssetChoice:
 
 
 def choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> list[tuple[str, str]]:
-    """Return the names to choose from, including the name that the form shows."""
+    """Return names with their labels, including the name or the refused file that the form shows."""
     known = asset_choices(assets, kind)
     if one.refused:
         return [("", f"your file {one.file} (refused)" if one.file else f"select a {kind.value}"), *known]
@@ -192,21 +189,17 @@ def choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> li
 
 
 def asset_choices(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
-    """Return the names to choose from, with a mark on assets that are still being checked."""
+    """Return names with their labels, which mark assets whose check has not ended."""
     try:
         known = assets.page(kind, limit=200).items
     except GraspdError:
         return []
-    newest = {asset.name: asset for asset in reversed(known)}
-    return [
-        (name, name if one.builtin or one.verdict else f"{name} (being checked)")
-        for name, one in sorted(newest.items())
-    ]
+    newest = sorted({asset.name: asset for asset in reversed(known)}.items())
+    return [(name, name if one.builtin or one.verdict else f"{name} (being checked)") for name, one in newest]
 
 
 def _text(fields: FormData, name: str) -> str:
-    value: Any = fields.get(name)
-    return value if isinstance(value, str) else ""
+    return value if isinstance(value := fields.get(name), str) else ""
 
 
 def _units(fields: FormData) -> str:

@@ -1,4 +1,4 @@
-"""Form of a job without JavaScript: estimated cost for each fidelity; submission, cancellation, retry."""
+"""Form of a job without JavaScript, with its estimated cost; submission, cancellation and retry of jobs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ router = APIRouter(include_in_schema=False)
 
 
 def fields_of(most: int) -> Any:
-    """Return a dependency that reads the fields of a form, at most `most`."""
+    """Return a dependency that reads a form of at most `most` fields."""
 
     async def fields(request: Request) -> AsyncIterator[FormData]:
         async with request.form(max_fields=most) as found:
@@ -74,9 +74,10 @@ class FormInput:
 
 def inputs_of(section: str = "", *, cells: bool = False) -> list[FormInput]:
     """Return the fields of a job's form, or of a dataset's with `cells`; an empty section means all."""
-    shown = [(row, row.form) for row in rows(JobOptions, "job") if row.form is not None]
     return [
-        FormInput.of(row, form) for row, form in shown if section in ("", form.section) and (form.cells or not cells)
+        FormInput.of(row, form)
+        for row in rows(JobOptions, "job")
+        if (form := row.form) and section in ("", form.section) and (form.cells or not cells)
     ]
 
 
@@ -122,18 +123,15 @@ def first_message(error: Exception) -> str:
 
 
 def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> HTMLResponse | RedirectResponse:
-    form: dict[str, Any] = {
-        name: fields[name]
-        for name in DEFAULTS
-        if name not in ("hand", "object") and isinstance(fields.get(name), str) and fields[name] != ""
-    }
+    names = [name for name in DEFAULTS if name not in ("hand", "object")]
+    form: dict[str, Any] = {name: fields[name] for name in names if isinstance(fields.get(name), str) and fields[name]}
     form |= {one.name: fields.get(one.name) == "true" for one in inputs_of() if one.kind == "checkbox"}
     things = {kind: choose_asset(request, assets, fields, kind) for kind in FILE_FIELDS}
     form |= {kind.value: one.name for kind, one in things.items()}
     shown = DEFAULTS | form | {"units": fields.get("units") or "m"}
     refused = {one.place(kind): one.refused.problem for kind, one in things.items() if one.refused}
     if any(fields.get(f"{kind.value}_fix") for kind in FILE_FIELDS):
-        # A suggestion's button only shows its result; the next press of the submit button submits.
+        # The button of a fix only shows its result; the submit button submits.
         return _form(request, assets, shown, things=things, errors=refused, status=422 if refused else 200)
     try:
         named = {kind.value: one.name or "unnamed" for kind, one in things.items()}
@@ -154,10 +152,10 @@ def _by_field(error: ValidationError) -> dict[str, str]:
     errors: dict[str, str] = {}
     for entry in error.errors():
         said = problem_text(entry)
-        # An error about several fields has no field; its message mostly starts with the name of one.
+        # An error about several fields has no place; its message mostly starts with the name of a field.
         word = said.partition(" ")[0]
-        whole = next((name for name in DEFAULTS if word in (name, name.rpartition("_")[2])), "scenes")
-        errors.setdefault(str(entry["loc"][0]) if entry["loc"] else whole, said)
+        named = next((name for name in DEFAULTS if word in (name, name.rpartition("_")[2])), "scenes")
+        errors.setdefault(str(entry["loc"][0]) if entry["loc"] else named, said)
     return errors
 
 
@@ -191,7 +189,7 @@ def _form(
     )
 
 
-#: Cache lifetime [s]: costs of batches change slowly, and reading two thousand of them is slow for a page.
+#: Cache lifetime of the costs of batches [s].
 KEPT_S: Final = 60.0
 WORDS: Final = {
     "draft": "Fewest points and starts, for a first look.",
@@ -205,7 +203,7 @@ def split_list(text: str) -> list[str]:
 
 
 class Expectations:
-    """Estimates for the form of a job; the only state is a cache of batch costs."""
+    """Estimates for the form of a job, with a cache of batch costs."""
 
     def __init__(self, index: Index) -> None:
         self._index = index
@@ -214,9 +212,7 @@ class Expectations:
 
     def of(self, form: Mapping[str, Any]) -> list[tuple[str, str, Estimate | None]]:
         """Return each offered fidelity, its description, and its estimate for a form; None if unknown."""
-        wanted = {
-            key: value for key, value in form.items() if key not in ("hand", "object", "fidelity") and value != ""
-        }
+        wanted = {key: value for key, value in form.items() if key not in ("hand", "object") and value != ""}
         wanted["neighbours"] = split_list(str(form.get("neighbours", "")))
         wanted |= {"hands": (str(form["hand"]),), "objects": (str(form["object"]),)}
         return [(name, WORDS[name], self._one(wanted | {"fidelity": name})) for name in OFFERED]
@@ -229,8 +225,7 @@ class Expectations:
 
     def _costs(self, stage: Stage) -> list[BatchCost]:
         with self._lock:
-            now = time.monotonic()
-            key = (stage, project_scope())
+            now, key = time.monotonic(), (stage, project_scope())
             if key not in self._read or now - self._read[key][0] > KEPT_S:
                 self._read[key] = (now, self._index.costs.of_batches(stage, scope=project_scope()))
             return self._read[key][1]

@@ -27,9 +27,7 @@ from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspType
 from graspd.service.model.states import AssetKind
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
-COLUMNS: Final = tuple(
-    (metric.name, metric.column_title, metric.unit) for metric in indexed_metrics(IndexLevel.OFFERED)
-)
+COLUMNS: Final = tuple((one.name, one.column_title, one.unit) for one in indexed_metrics(IndexLevel.OFFERED))
 #: Metrics for which less is better: the first click sorts in ascending order.
 _LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed_metrics() if metric.less_is_better)
 _BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness", "robust_share", "grasp_type", "approach_cell"})
@@ -44,10 +42,10 @@ router = APIRouter(include_in_schema=False)
 def grasps_page(
     request: Request, grasps: GraspsOf, shards: ShardsOf, assets: AssetsOf, tags: TagsOf
 ) -> HTMLResponse | RedirectResponse:
-    """List grasps with filters, order and pages; the URL contains these settings, without empty fields."""
+    """List grasps with filters, order and pages, all of which are in the URL, without empty fields."""
     given = {key: value for key, value in request.query_params.items() if value}
+    # Forms send every field; the visible URL should be short.
     if len(given) < len(request.query_params):
-        # Forms send every field; the visible URL should be short.
         return RedirectResponse(f"/grasps?{urlencode(given)}" if given else "/grasps", status_code=303)
     said = action_summary(given)
     cursor, view = given.pop("cursor", None), given.pop("view", "cards")
@@ -59,18 +57,18 @@ def grasps_page(
     except (ValueError, InputError) as error:
         problem = first_message(error)
     rows = page.items if page else []
-    known = tags.all()
+    known, is_filtered = tags.all(), bool(given.keys() - {"sort", "order"})
     return render(
         request,
         "grasps.html",
         status=422 if problem else 200,
         page="/grasps",
         filters={name: given.get(name, "") for name in GraspQuery.model_fields},
-        filtered=bool(set(given) - {"sort", "order"}),
+        filtered=is_filtered,
         problem=problem,
         did=said,
         **tag_choices(tags, rows, known, given),
-        all_said="all that match the filters" if set(given) - {"sort", "order"} else "all grasps",
+        all_said="all that match the filters" if is_filtered else "all grasps",
         here="/grasps",
         shown_tag=next((tag for tag in known if tag.name == query.tag), None),
         tag_choices=[(tag.name, tag.name) for tag in known],
@@ -124,11 +122,8 @@ def grasp_page(
 def tag_choices(
     tags: Tags, rows: Sequence[GraspView], known: Sequence[TagView], where: Mapping[str, str]
 ) -> dict[str, Any]:
-    return {
-        "tagged": tags.of([(grasp.shard_id, grasp.row) for grasp in rows]),
-        "tags": known,
-        "filter": urlencode(where),
-    }
+    tagged = tags.of([(grasp.shard_id, grasp.row) for grasp in rows])
+    return {"tagged": tagged, "tags": known, "filter": urlencode(where)}
 
 
 def _names(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
@@ -193,11 +188,10 @@ def _tag(tags: Tags, fields: FormData, *, on: bool) -> RedirectResponse:
     change = tags.give(name, selection) if on else tags.untag(name, selection)
     said = {"did": "tagged" if on else "untagged", "done": change.changed, "named": name}
     here = str(fields.get("here", ""))
-    here = here if _PAGES.fullmatch(here) else "/grasps"
-    kept = dict(_filter(fields)) if here == "/grasps" else {}
-    if here == "/grasps" and fields.get("view") == "table":
-        kept["view"] = "table"
-    return RedirectResponse(f"{here}?{urlencode(kept | said)}", status_code=303)
+    if _PAGES.fullmatch(here) and here != "/grasps":
+        return RedirectResponse(f"{here}?{urlencode(said)}", status_code=303)
+    view = {"view": "table"} if fields.get("view") == "table" else {}
+    return RedirectResponse(f"/grasps?{urlencode(dict(_filter(fields)) | view | said)}", status_code=303)
 
 
 def _selection(fields: FormData) -> Selection:

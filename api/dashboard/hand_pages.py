@@ -33,13 +33,9 @@ def hands_page(
 ) -> HTMLResponse:
     """Show all hands, also refused ones; their pages state the reason."""
     page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor, refused=True)
-    # `facts` contains data from the upload besides findings of the check, so values may be of any type.
-    numbers = {
-        hand.digest: [
-            len(told) if isinstance(told, list) else 0 for told in map(hand.facts.get, ("dofs", "fingertips"))
-        ]
-        for hand in page.items
-    }
+    # `facts` contains data from the upload, so that values may be of any type.
+    facts = {hand.digest: [hand.facts.get(name) for name in ("dofs", "fingertips")] for hand in page.items}
+    numbers = {key: [len(one) if isinstance(one, list) else 0 for one in found] for key, found in facts.items()}
     networks = [] if cursor else assets.page(AssetKind.NETWORK, limit=PAGE_SIZE).items
     return render(
         request,
@@ -105,7 +101,7 @@ def _page(
 
 
 def _facts(assets: Assets, hand: AssetView) -> tuple[HandFacts | None, str]:
-    """Return the facts of a hand, or the reason why it cannot be shown; neither while its check runs."""
+    """Return the facts of a hand, or why it cannot be shown; neither while its check runs."""
     try:
         return assets.hand_facts(hand), ""
     except NotFoundError:

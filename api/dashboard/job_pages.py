@@ -96,7 +96,7 @@ def _pictures(job: JobDetail) -> list[dict[str, Any]]:
     ]
 
 
-#: Number of cached shards. A shard of 48 pictures takes a few megabytes; a page requests several of its pictures.
+#: Number of cached shards, of a few megabytes each; a page requests several pictures of a shard.
 _KEPT_SHARDS: Final = 2
 #: Colours of depth, from near (light, warm) to far (dark, cool); the lightness falls monotonically.
 _DEPTH_COLOURS: Final = np.array(
@@ -125,7 +125,7 @@ class Pictures:
             pictures = file[path]
             if not 0 <= index < len(pictures):
                 raise NotFoundError(f"the shard has {len(pictures)} pictures; there is no picture {index}")
-            pixels = _PAINTERS[channel](pictures[index])
+            pixels = _PAINTERS.get(channel, np.asarray)(pictures[index])
         image = Image.fromarray(pixels)
         if width is not None and width < image.width:
             kind = Image.Resampling.NEAREST if channel == "segmentation" else Image.Resampling.LANCZOS
@@ -138,8 +138,7 @@ class Pictures:
 def paint_depth(depth: NDArray[Any]) -> NDArray[np.uint8]:
     """Colour depth (H, W) [m] as (H, W, 3) over the picture's range; pixels without a surface are dark."""
     seen = np.isfinite(depth)
-    painted = np.empty((*depth.shape, 3), np.uint8)
-    painted[:] = _NOTHING
+    painted = np.full((*depth.shape, 3), _NOTHING, np.uint8)
     if seen.any():
         low, high = np.percentile(depth[seen], (1, 99))
         place = np.clip((depth[seen] - low) / max(high - low, 1e-6), 0, 1) * (len(_DEPTH_COLOURS) - 1)
@@ -154,9 +153,5 @@ def paint_segmentation(labels: NDArray[Any]) -> NDArray[np.uint8]:
     return _CLASSES[np.minimum(labels, len(_CLASSES) - 1)]
 
 
-_PAINTERS: Final[dict[str, Callable[[Any], NDArray[Any]]]] = {
-    "rgb": np.asarray,
-    "rgb_hand": np.asarray,
-    "depth": paint_depth,
-    "segmentation": paint_segmentation,
-}
+#: Functions that colour channels without colours.
+_PAINTERS: Final[dict[str, Callable[..., NDArray[Any]]]] = {"depth": paint_depth, "segmentation": paint_segmentation}

@@ -1,7 +1,4 @@
-"""Pages of the service: home, workers, charts, failure maps, usage, deletions, problem types, session.
-
-Sign-in with a key sets a signed cookie. It is valid for at most 12 hours, and only while the key is valid.
-"""
+"""Pages of the service: home, workers, charts, failure maps, usage, deletions, problem types, session."""
 
 from __future__ import annotations
 
@@ -113,7 +110,7 @@ def chart_page(
         page="/chart",
         poll_s=_STUDY_S,
         charts=list(zip(measured, drawn, strict=True)),
-        # For each kind of chart: title, name in the URL, accuracies, and the selected one.
+        # For each kind of chart: title, name in the URL, accuracies, and the selected accuracy.
         choices=[
             (title, field, axes, axis[in_scene])
             for title, field, axes, in_scene in (
@@ -132,24 +129,18 @@ def chart_page(
 @router.get("/stability", dependencies=READ)
 def stability_page(request: Request, store: StoreOf) -> HTMLResponse:
     measured = figures.load_stability(store)
-    return render(
-        request,
-        "stability.html",
-        page="/stability",
-        poll_s=_STUDY_S,
-        measured=measured,
-        maps=[figures.draw_map(one) for one in measured.maps] if measured else [],
-    )
+    maps = [figures.draw_map(one) for one in measured.maps] if measured else []
+    return render(request, "stability.html", page="/stability", poll_s=_STUDY_S, measured=measured, maps=maps)
 
 
 def is_recent(worker: WorkerView) -> bool:
-    """Check whether to show a worker; a lost one stays visible for a while, so that users notice its loss."""
+    """Check whether to show a worker; a lost worker is shown for 10 minutes."""
     age = datetime.now(UTC) - datetime.fromisoformat(worker.seen)
     return worker.state != "lost" or age < _LOST_SHOWN
 
 
 def stage_depths(overview: Overview) -> list[tuple[str, int]]:
-    """Return numbers of waiting tasks by stage; empty if Redis does not answer, as the page reports."""
+    """Return numbers of waiting tasks by stage; empty if Redis does not answer."""
     try:
         depths = overview.depths()
     except UnavailableError:
@@ -273,19 +264,19 @@ def explorer(request: Request) -> HTMLResponse:
 @router.get("/problems/{slug}")
 def problem_types(request: Request, slug: str = "") -> HTMLResponse:
     types = [(name, error.status, (error.__doc__ or "").splitlines()[0]) for name, error in ERRORS.items()]
-    types += [(name, status, text) for name, (status, text) in _HTTP_PROBLEMS.items()]
+    types += _HTTP_PROBLEMS
     return render(request, "problems.html", types=sorted(types, key=lambda row: (row[1], row[0])))
 
 
-_HTTP_PROBLEMS: Final = {
-    "bad-request": (400, "The body or form cannot be read."),
-    "unauthorized": (401, "A valid key is required."),
-    "forbidden": (403, "The scope of the key is insufficient, or the request comes from a foreign web page."),
-    "method-not-allowed": (405, "The address does not support this method."),
-    "unsupported-media-type": (415, "The body is compressed or otherwise encoded; send it unencoded."),
-    "range-not-satisfiable": (416, "The byte range starts after the end of the file."),
-    "misdirected-request": (421, "The service does not accept this host name while it has no keys."),
-}
+_HTTP_PROBLEMS: Final = (
+    ("bad-request", 400, "The body or form cannot be read."),
+    ("unauthorized", 401, "A valid key is required."),
+    ("forbidden", 403, "The scope of the key is insufficient, or the request comes from another web site."),
+    ("method-not-allowed", 405, "The address does not support this method."),
+    ("unsupported-media-type", 415, "The body is compressed or otherwise encoded; send it unencoded."),
+    ("range-not-satisfiable", 416, "The byte range starts after the end of the file."),
+    ("misdirected-request", 421, "The service does not accept this host name while it has no keys."),
+)
 
 
 @router.get("/login")

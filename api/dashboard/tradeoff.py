@@ -1,14 +1,12 @@
-"""Charts of speed against accuracy, published by `graspd chart`: read, aggregated, drawn as SVG.
-
-There is one chart for free objects and one for each kind of scene: they measure different tasks.
-"""
+"""Charts of speed against accuracy, published by `graspd chart`: read, aggregated, drawn as SVG."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 from pydantic import BaseModel
 
@@ -56,7 +54,7 @@ IN_SCENES: Final[dict[str, Axis]] = {
 
 
 class Run(BaseModel):
-    """Run of a method at a fidelity on a hand and object; in a scene its grasps are planned or filtered."""
+    """Run of a method at a fidelity on a hand and object; `way`: how grasps in a scene were made."""
 
     method: str
     fidelity: str
@@ -157,14 +155,12 @@ class Drawing:
 
 
 def load_charts(store: Store) -> list[Measured]:
-    """Load the last published charts, free objects first; unreadable ones are omitted."""
+    """Load the newest published chart of each kind, free objects first, without unreadable charts."""
     found = []
     for kind in (CHARTS, *scene_kinds(store)):
-        try:
-            content = latest_record(store, kind)
-            found += [] if content is None else [Measured.model_validate(content)]
-        except (ValueError, DamagedError):
-            continue
+        with suppress(ValueError, DamagedError):
+            if (content := latest_record(store, kind)) is not None:
+                found.append(Measured.model_validate(content))
     return found
 
 
@@ -204,7 +200,7 @@ def _point(runs: list[Run], axis: str, scale: float, names: list[str]) -> Point 
         fidelity=runs[0].fidelity,
         pairs=len(runs),
         speed=speed,
-        # The time of pairs without a grasp is unknown; a mean over the others would be too favourable.
+        # Pairs without a grasp have no time; a mean over the other pairs would be too favourable.
         first_valid_s=sum(firsts) / len(firsts) if len(firsts) == len(runs) else None,
         accuracy=scale * sum(values) / len(values),
         series=names.index(runs[0].name) % 6,
@@ -212,10 +208,7 @@ def _point(runs: list[Run], axis: str, scale: float, names: list[str]) -> Point 
 
 
 def _speed(runs: Sequence[Run]) -> float:
-    """Return the number of grasps found per second of total time; 0 if there are none.
-
-    Charts of graspd 0.1 contain only speeds. Speeds of objects differ by factors, so their mean is geometric.
-    """
+    """Return the number of grasps per second of total time; in charts of graspd 0.1, the geometric mean speed."""
     if all(run.found is not None for run in runs) and (seconds := sum(run.seconds for run in runs)):
         return sum(run.found or 0 for run in runs) / seconds
     speeds = [run.valid_per_second for run in runs if run.valid_per_second]
@@ -223,14 +216,14 @@ def _speed(runs: Sequence[Run]) -> float:
 
 
 def _place_labels(points: list[Point]) -> list[Point]:
-    """Place labels beside their points, left or right, up or down, where they overlap the least."""
+    """Place labels left or right of their points, and up or down, so that they overlap the least."""
     taken = [(p.x - _DOT, p.y - _DOT, p.x + _DOT, p.y + _DOT) for p in points]
     placed: list[Point] = []
     for point in sorted(points, key=lambda point: point.y):
         offers = [(move, is_left) for move in _MOVES for is_left in (False, True)]
         boxes = [point.label_box(move, is_left=is_left) for move, is_left in offers]
         costs = [sum(_overlap_area(box, other) for other in taken) + _outside_cost(box) for box in boxes]
-        # Of equally good places the first one is used, because it is nearest to the point.
+        # The first of equally good places is nearest to the point.
         best = costs.index(min(costs))
         move, is_left = offers[best]
         taken.append(boxes[best])
@@ -264,14 +257,10 @@ def _logarithmic(values: Sequence[float]) -> tuple[Callable[[float], float], lis
 def _linear(values: Sequence[float], *, top: float | None) -> tuple[Callable[[float], float], list[tuple[float, str]]]:
     highest = max(values, default=1.0)
     end = top if top is not None else highest * 1.15 or 1.0
-    step = _round_step(end / 5)
+    size = 10.0 ** math.floor(math.log10(end / 5))
+    step = next(size * m for m in (1, 2, 2.5, 5, 10) if size * m >= end / 5 * 0.999)
 
     def place(value: float) -> float:
         return HEIGHT - _BOTTOM - value / end * (HEIGHT - _TOP - _BOTTOM)
 
     return place, [(place(step * i), f"{step * i:g}") for i in range(int(end / step + 1e-9) + 1)]
-
-
-def _round_step(value: float) -> float:
-    size: Any = 10.0 ** math.floor(math.log10(value))
-    return next(float(size * m) for m in (1, 2, 2.5, 5, 10) if size * m >= value * 0.999)

@@ -1,8 +1,8 @@
 """Limits of requests: rate and concurrency for each caller; size and duration of bodies.
 
 Rates follow GCRA (ITU-T I.371 annex A), a leaky bucket. One number is stored per caller: the time at which the bucket
-is empty again. Requests in progress form a sorted set with an expiry time each, so that requests of a killed process
-expire. Times come from Redis's clock, so clocks of the API machines do not matter.
+is empty again. Requests in progress form a sorted set of expiry times, so that requests of a killed process expire.
+All times come from Redis's clock.
 """
 
 from __future__ import annotations
@@ -38,9 +38,8 @@ _FREE: Final = ("/static/", "/healthz", "/readyz")
 class RateLimit(HttpMiddleware):
     """Stores the key of a request in `scope["state"]["key"]` and enforces the limits of that key.
 
-    A request without a key counts against its address. While there are no keys, there are no limits.
-    Refusals are 429 with Retry-After; every counted response has RateLimit and RateLimit-Policy
-    (draft-ietf-httpapi-ratelimit-headers-10).
+    A request without a key counts against its address. While there are no keys, there are no limits. Responses have
+    the headers RateLimit and RateLimit-Policy (draft-ietf-httpapi-ratelimit-headers-10).
     """
 
     def __init__(self, app: ASGIApp, *, keys: KeyFile, proxy: Proxy, settings: Settings, rates: Rates) -> None:
@@ -67,7 +66,7 @@ class RateLimit(HttpMiddleware):
         request = Request(scope)
         name = f"key:{key.name}" if key else f"address:{request.client.host if request.client else ''}"
         allowance = _allowance_of(key, self.settings)
-        # The request's id is unsuitable: a caller could choose equal ids, so that many requests count as one.
+        # A caller could send many requests with the same id, so that they would count as one.
         number = uuid.uuid4().hex
         admission = await self.rates.enter(name, allowance, number)
         if admission is None:
@@ -118,8 +117,7 @@ def _headers(allowance: Allowance, admission: Admission) -> dict[str, str]:
 def _refusal(admission: Admission, allowance: Allowance, headers: dict[str, str]) -> ApiError:
     wait = _seconds_up(admission.seconds)
     if admission.refused == "concurrency":
-        reason = f"{allowance.concurrency} of your requests are in progress, the maximum at once"
-        headers = {}
+        reason, headers = f"{allowance.concurrency} of your requests are in progress, the maximum at once", {}
     else:
         reason = f"more than {allowance.per_minute} requests in a minute"
     return ApiError(429, f"{reason}; try again in {wait} s", headers=headers | {"Retry-After": str(wait)})
@@ -130,7 +128,7 @@ WINDOW_S: Final = 60
 #: Time without renewal [s] after which a request no longer counts as in progress.
 HELD_S: Final = 60.0
 _ANSWER_S: Final = 0.5
-#: Time without limits after a failure of Redis [s], because limits do not justify a delay of every request.
+#: Time without limits after a failure of Redis [s]; otherwise each request would wait for Redis.
 _PAUSE_S: Final = 1.0
 
 _ENTER: Final = """
@@ -187,7 +185,7 @@ class Admission:
 
 
 class Rates:
-    """Counters of all callers. Without Redis every request is admitted: limits are not access control."""
+    """Counters of all callers in Redis; without Redis, every request is admitted."""
 
     def __init__(self, url: str) -> None:
         self._url = url
@@ -242,10 +240,10 @@ def _seconds_up(seconds: float) -> int:
 #: Size limit of a JSON body or a form without a file; job requests take a few hundred bytes.
 MAX_BODY_BYTES: Final = 1 << 20
 PIECE_S: Final = 30.0
-#: Least transfer rate of a body [bytes/s]; otherwise single bytes could keep a connection open forever.
+#: Least transfer rate of a body [bytes/s].
 LEAST_BYTES_S: Final = 16 << 10
 _FORM_SLACK_BYTES: Final = 64 << 10
-#: Most digits of a Content-Length; Python parses thousands of digits slowly, or refuses them.
+#: Maximum number of digits of a Content-Length; Python parses thousands of digits slowly, or refuses them.
 _MOST_DIGITS: Final = 18
 
 
@@ -265,8 +263,8 @@ class BodyLimit(HttpMiddleware):
         limit = self.upload_bytes + _FORM_SLACK_BYTES if is_upload else MAX_BODY_BYTES
         if (refusal := _body_refusal(scope, limit, is_upload=is_upload)) is not None:
             await _refuse(refusal, scope, receive, send)
-            return
-        await self._watch(scope, receive, send, limit)
+        else:
+            await self._watch(scope, receive, send, limit)
 
     async def _watch(self, scope: Scope, receive: Receive, send: Send, limit: int) -> None:
         received, began = 0, time.monotonic()
@@ -314,20 +312,15 @@ def _body_refusal(scope: Scope, limit: int, *, is_upload: bool) -> Exception | N
         return ApiError(400, "Transfer-Encoding and Content-Length exclude each other")
     encoding = given.get(b"content-encoding", b"").decode("latin-1").strip().lower()
     if encoding not in ("", "identity") and scope["method"] not in SAFE_METHODS:
-        return ApiError(
-            415,
-            f"the body has Content-Encoding {encoding[:40]!r}; send an unencoded body",
-            headers={"Accept-Encoding": "identity"},
-        )
+        problem = f"the body has Content-Encoding {encoding[:40]!r}; send an unencoded body"
+        return ApiError(415, problem, headers={"Accept-Encoding": "identity"})
     declared = given.get(b"content-length", b"0")
     if not declared.isdigit() or len(declared) > _MOST_DIGITS or int(declared) > limit:
         return _too_large(limit)
     if declared != b"0" or b"transfer-encoding" in given:
         try:
-            if is_upload:
-                authorize(Request(scope), KeyScope.SUBMIT)
-            elif scope["path"].startswith("/v1/"):
-                authorize(Request(scope), KeyScope.READ)
+            if is_upload or scope["path"].startswith("/v1/"):
+                authorize(Request(scope), KeyScope.SUBMIT if is_upload else KeyScope.READ)
         except ApiError as error:
             return error
     return None

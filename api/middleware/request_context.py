@@ -1,7 +1,7 @@
 """Middleware of all routes: request ids, security headers, HEAD (RFC 9110 §9.3.2), prefix, origin.
 
-The application's paths have no prefix. It is removed from incoming paths here, unless the proxy already did so, and
-added to addresses in response headers. Rendering adds it to addresses in pages (`with_prefix`).
+The application's paths have no prefix. `RootPath` removes the prefix from paths of requests, unless the proxy already
+did, and adds it to response headers; rendering adds it to addresses in pages (`with_prefix`).
 """
 
 from __future__ import annotations
@@ -72,8 +72,7 @@ class RequestContext(HttpMiddleware):
             await self._answer(scope, receive, send, request_id)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, request_id: str) -> None:
-        started = time.perf_counter()
-        status = 0
+        started, status = time.perf_counter(), 0
 
         async def with_headers(message: Message) -> None:
             nonlocal status
@@ -101,7 +100,7 @@ class RequestContext(HttpMiddleware):
             self._note(scope, status, time.perf_counter() - started)
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
-        route = _route(scope)
+        route = getattr(scope.get("route"), "path", "unmatched")
         self.metrics.observe(_method(scope), route, status, seconds)
         level = logging.DEBUG if scope["path"].startswith(_QUIET) else logging.INFO
         key = scope["state"].get("key")
@@ -115,15 +114,12 @@ def _method(scope: Scope) -> str:
     return scope["method"] if scope["method"] in _METHODS else "other"
 
 
-def _route(scope: Scope) -> str:
-    return getattr(scope.get("route"), "path", "unmatched")
-
-
 class Head(HttpMiddleware):
+    """Answers HEAD like GET without the body, unless a route has its own HEAD."""
+
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["method"] != "HEAD" or any(
-            route.matches(dict(scope))[0] is Match.FULL for route in scope["app"].routes
-        ):
+        routes = scope["app"].routes
+        if scope["method"] != "HEAD" or any(route.matches(dict(scope))[0] is Match.FULL for route in routes):
             await self.app(scope, receive, send)
             return
 
@@ -133,7 +129,7 @@ class Head(HttpMiddleware):
             nonlocal is_over
             if message["type"] == "http.response.start":
                 await send(message)
-                # A response without a length may be endless, so it ends now. The others run on and close their files.
+                # A response without a length may be endless, so it ends now; others continue and close their files.
                 is_last = all(name.lower() != b"content-length" for name, _ in message["headers"])
             else:
                 is_last = not message.get("more_body", False)
@@ -149,7 +145,7 @@ class Head(HttpMiddleware):
             scope["method"], scope["headers"] = "HEAD", headers
 
 
-#: HTML attributes whose value is an address on this host. In a page, texts from users contain no quotes.
+#: HTML attributes whose value is an address on this host; quotes in texts from users are escaped.
 _ADDRESS: Final = re.compile(r'(?<=\s)((?:href|src|action|formaction|hx-[a-z-]+|data-[a-z-]+)=")(?=/(?!/))')
 _COOKIE_PATH: Final = re.compile(r";\s*Path=/(?=;|$)", re.IGNORECASE)
 
@@ -196,8 +192,7 @@ def with_prefix(page: str, prefix: str) -> str:
 class SameOrigin(HttpMiddleware):
     """Refuses requests that a page of another site triggers in a visitor's browser.
 
-    Browsers send the origin of the requesting page (Sec-Fetch-Site, Origin); other clients do not. While no keys exist,
-    only names of this machine are accepted as the host, to prevent DNS rebinding.
+    While no keys exist, the host must be a name of this machine, to prevent DNS rebinding.
     """
 
     def __init__(self, app: ASGIApp, *, allowed_hosts: frozenset[str] | None) -> None:
@@ -215,8 +210,7 @@ class SameOrigin(HttpMiddleware):
             return ApiError(421, f"this service does not accept the host name {host_name(host)!r}; use 127.0.0.1")
         if scope["method"] in SAFE_METHODS:
             return None
-        site = headers.get("sec-fetch-site")
-        origin = headers.get("origin")
+        site, origin = headers.get("sec-fetch-site"), headers.get("origin")
         if site not in (None, "same-origin", "none"):
             return ApiError(403, "the request comes from another web site; open the dashboard itself and try again")
         if origin is not None and _place(origin) != host:

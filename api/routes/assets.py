@@ -15,17 +15,7 @@ from starlette.datastructures import UploadFile as AnyUpload
 
 from graspd.api.catalog.assets import Assets
 from graspd.api.problems import problem_responses
-from graspd.api.routes.dependencies import (
-    READ,
-    SUBMIT,
-    UPLOADS,
-    AssetsOf,
-    Cursor,
-    Limit,
-    Paging,
-    RequestLimiter,
-    is_unmodified,
-)
+from graspd.api.routes.dependencies import READ, SUBMIT, UPLOADS, AssetsOf, PagingOf, RequestLimiter, is_unmodified
 from graspd.api.uploads import files_of_upload, name_of_upload
 from graspd.service.index.views import AssetView, Page
 from graspd.service.model.base import Name
@@ -39,11 +29,7 @@ _AT_ONCE: Final = BoundedSemaphore(UPLOADS)
 _TURN_S: Final = 20.0
 
 _ZIPPED: Final = "Upload a file, or a ZIP of its folder. A worker checks the asset before a job uses it."
-_ADDED: Final = {
-    AssetKind.HAND: _ZIPPED,
-    AssetKind.OBJECT: _ZIPPED,
-    AssetKind.NETWORK: "Upload a proposal network: an `.npz` of the schema `graspd/proposals@1`.",
-}
+_NETWORK: Final = "Upload a proposal network: an `.npz` of the schema `graspd/proposals@1`."
 
 
 @cache
@@ -52,16 +38,12 @@ def asset_router(kind: AssetKind) -> APIRouter:
 
     @router.get("", dependencies=READ, name=f"list_{kind}s")
     def list_assets(
-        request: Request,
-        response: Response,
         assets: AssetsOf,
-        limit: Limit = 50,
-        cursor: Cursor = None,
+        paging: PagingOf,
         refused: Annotated[bool, Query(description="include assets that the check refused")] = False,
     ) -> Page[AssetView]:
         """List all assets of this kind, newest first; refused ones only on request."""
-        page = assets.page(kind, limit=limit, cursor=cursor, refused=refused)
-        return Paging(request, response, limit, cursor).linked(page)
+        return paging.linked(assets.page(kind, limit=paging.limit, cursor=paging.cursor, refused=refused))
 
     @router.get("/{name}", dependencies=READ, responses=problem_responses(404), name=f"get_{kind}")
     def get_asset(name: str, assets: AssetsOf) -> AssetView:
@@ -77,7 +59,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         dependencies=SUBMIT,
         responses=problem_responses(400, 409),
         name=f"add_{kind}",
-        description=_ADDED[kind],
+        description=_NETWORK if kind is AssetKind.NETWORK else _ZIPPED,
     )
     async def add_asset(
         file: UploadFile,
@@ -85,17 +67,10 @@ def asset_router(kind: AssetKind) -> APIRouter:
         request: Request,
         assets: AssetsOf,
         name: Annotated[Name | None, Form()] = None,
-        options: Annotated[
-            str, Form(description='JSON object with keys of asset.json, such as {"units": "mm"}', max_length=65536)
-        ] = "",
-        self_test: Annotated[
-            bool,
-            Form(description="hands only: the check ends with 80 grasps of simple shapes, which takes some minutes"),
-        ] = False,
+        options: Annotated[str, Form(description='JSON of asset.json keys: {"units": "mm"}', max_length=65536)] = "",
+        self_test: Annotated[bool, Form(description="hands only: run the self-test, for some minutes")] = False,
         shared: Annotated[bool, Form(description="whether all projects may use it, not only the key's")] = False,
-        rename: Annotated[
-            bool, Form(description="whether the asset gets the next free name if its name is taken")
-        ] = False,
+        rename: Annotated[bool, Form(description="use the next free name if the name is taken")] = False,
     ) -> AssetView:
         uploads: RequestLimiter = request.app.state.uploads
         if self_test and kind is not AssetKind.HAND:
@@ -154,11 +129,7 @@ def store_upload(
     options: str = "",
     **said: bool,
 ) -> AssetView:
-    """Store an upload, so far a temporary file, as an immutable asset with a check task.
-
-    `said` has `self_test`, `shared` and `rename`, as in `Assets.add`. The number of concurrent uploads is limited, to
-    bound their memory.
-    """
+    """Store an uploaded file as an immutable asset with a check task; `said`: options of `Assets.add`."""
     filename = file.filename or ""
     with _upload_slot():
         files = files_of_upload(kind, filename, file.file, limit_bytes=limit_bytes, options=options)

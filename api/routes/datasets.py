@@ -23,9 +23,7 @@ routers = (router, sets_router)
 
 DatasetName = Annotated[str, Path(max_length=64)]
 SnapshotDigest = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
-_ENDED: dict[int | str, dict[str, Any]] = {
-    200: {"model": DatasetView, "description": "The dataset existed already and has ended"}
-}
+_ENDED: dict[int | str, dict[str, Any]] = {200: {"model": DatasetView, "description": "The dataset has ended already"}}
 
 
 class ObjectSetRequest(BaseModel):
@@ -39,7 +37,7 @@ class ObjectSetRequest(BaseModel):
 
 @router.post("", status_code=202, dependencies=SUBMIT, responses=problem_responses(400, 404, 409, others=_ENDED))
 def create_dataset(body: DatasetRequest, response: Response, datasets: DatasetsOf) -> DatasetView:
-    """Create a dataset. The same name and content give the same dataset; existing results are reused."""
+    """Create a dataset. Identical content gives the same dataset; existing results are reused."""
     dataset = datasets.create(body)
     if dataset.state.is_final:
         response.status_code = 200
@@ -53,7 +51,7 @@ def estimate_dataset(body: Matrix, datasets: DatasetsOf) -> Estimate:
 
 
 class _NoDataset:
-    """Reserved path: no dataset may be named `estimate`, so only POST is valid there."""
+    """Path of the estimate, for methods other than POST; no dataset may be named `estimate`."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         raise ApiError(405, "request an estimate with POST", headers={"Allow": "POST"})
@@ -97,14 +95,9 @@ def retry_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -
 def delete_dataset(
     name: DatasetName,
     datasets: DatasetsOf,
-    with_snapshots: Annotated[
-        bool, Query(description="whether to delete its snapshots too; otherwise they protect it")
-    ] = False,
+    with_snapshots: Annotated[bool, Query(description="delete its snapshots too; otherwise they protect it")] = False,
 ) -> None:
-    """Delete an ended dataset, and those of its jobs that belong to it alone.
-
-    `POST .../restore` restores them within the grace time.
-    """
+    """Delete an ended dataset, and jobs that belong to it alone; `POST .../restore` restores them."""
     datasets.delete(name, with_snapshots=with_snapshots)
 
 

@@ -66,7 +66,7 @@ SUBMIT: Final = [Depends(may_submit)]
 
 
 def may_scrape(request: Request) -> None:
-    """Allow callers that may read, or all callers if the settings permit it."""
+    """Raise ApiError unless the caller may read, or the settings permit all callers."""
     if request.app.state.settings.metrics_need_key:
         authorize(request, Scope.READ)
 
@@ -124,7 +124,7 @@ def next_address(request: Request, cursor: str) -> str:
 
 
 UPLOADS: Final = 4
-#: Most forms with an upload at once; they also wait for the check of the upload.
+#: Maximum number of concurrent forms with an upload; they also wait for the check of the upload.
 FORMS: Final = 8
 EXPORTS: Final = 2
 _MOST_WAITING: Final = 32
@@ -132,7 +132,7 @@ _PATIENCE_S: Final = 20.0
 
 
 class RequestLimiter:
-    """Pool with limits on its threads and on the requests that wait for one."""
+    """Pool of threads with a limited number of waiting requests."""
 
     def __init__(self, at_once: int, *, patience_s: float = _PATIENCE_S) -> None:
         self._free = asyncio.Semaphore(at_once)
@@ -141,7 +141,7 @@ class RequestLimiter:
         self._patience_s = patience_s
 
     async def run(self, function: Callable[..., T], *args: Any, **options: Any) -> T:
-        """Run a function in a thread of this pool; UnavailableError if none becomes free in time."""
+        """Run a function in a thread of this pool; raise UnavailableError if none becomes free in time."""
         await self._take()
         try:
             return await to_thread.run_sync(partial(function, *args, **options), limiter=self._threads)
@@ -166,14 +166,13 @@ _TAGS: Final = re.compile(r'\s*((?:W/)?"[^"]*")\s*(?:,|$)')
 
 
 def is_unmodified(headers: Headers, etag: str) -> bool:
-    """Check whether If-None-Match is * or has this file's tag (weak comparison); the response is then 304."""
+    """Check whether If-None-Match is * or has the file's tag (weak comparison), so that the response is 304."""
     given = headers.getlist("if-none-match")
-    return any(value.strip() == "*" for value in given) or etag in {
-        tag.removeprefix("W/") for value in given for tag in _TAGS.findall(value)
-    }
+    tags = {tag.removeprefix("W/") for value in given for tag in _TAGS.findall(value)}
+    return etag in tags or any(value.strip() == "*" for value in given)
 
 
 def range_applies(headers: Headers, etag: str) -> bool:
-    """Check whether Range applies: If-Range is absent or has the tag; dates are neither sent nor matched."""
+    """Check whether Range applies: If-Range is absent or has the tag; a date never matches."""
     given = headers.get("if-range")
     return given is None or given.strip() == etag

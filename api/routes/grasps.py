@@ -55,11 +55,8 @@ async def export_response(
 ) -> StreamingResponse:
     said = selection.model_dump(mode="json", exclude_none=True)
     size, chunks = await request.app.state.exports.run(lambda: exports.export(tags.chosen(selection), format, said))
-    headers = {
-        "Content-Length": str(size),
-        "Content-Disposition": f'attachment; filename="grasps.{format}"',
-        "Cache-Control": "private, no-store",
-    }
+    headers = {"Content-Length": str(size), "Cache-Control": "private, no-store"}
+    headers["Content-Disposition"] = f'attachment; filename="grasps.{format}"'
     return StreamingResponse(chunks, media_type=MEDIA_TYPES[format], headers=headers)
 
 

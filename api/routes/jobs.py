@@ -20,10 +20,7 @@ from graspd.service.model.states import State
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
-IdempotencyKey = Annotated[
-    str | None,
-    Header(max_length=255, description="the same key with another body is refused; equal requests give the same job"),
-]
+IdempotencyKey = Annotated[str | None, Header(max_length=255, description="the same key with another body is refused")]
 
 
 @router.post(
@@ -79,12 +76,12 @@ def retry(job_id: str, jobs: JobsOf) -> JobDetail:
 
 @router.delete("/{job_id}", status_code=204, dependencies=SUBMIT, responses=problem_responses(404, 409))
 def delete(job_id: str, jobs: JobsOf) -> None:
-    """Delete an ended job; `POST .../restore` restores it. Shards that only it uses stay for a grace time."""
+    """Delete an ended job; `POST .../restore` restores it within the grace time."""
     jobs.delete(job_id)
 
 
 def require_known_job(job_id: str, jobs: JobsOf) -> None:
-    """Refuse an unknown job before its event stream starts, because the HTTP status cannot change later."""
+    """Raise NotFoundError for an unknown job before its event stream starts with status 200."""
     jobs.get_progress(job_id)
 
 
@@ -103,7 +100,7 @@ async def watch(job_id: str, request: Request, jobs: JobsOf) -> AsyncIterable[Se
 shard_router = APIRouter(prefix="/v1/shards", tags=["shards"])
 
 _MEDIA_TYPE = "application/x-hdf5"
-#: Most digits of a file size. A longer number in a range is invalid, and the whole file is sent.
+#: A number of more than 18 digits in a range is invalid, and the whole file is sent.
 _RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
 
@@ -141,7 +138,7 @@ def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
     ),
 )
 def get_file(shard_id: str, request: Request, shards: ShardsOf) -> Response:
-    """Send the HDF5 file, or redirect to the store if it signs addresses. A damaged file is refused.
+    """Send the HDF5 file, or redirect to a signed address of the store. A damaged file is refused.
 
     Range, If-None-Match and If-Range are supported.
     """

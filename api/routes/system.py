@@ -40,7 +40,7 @@ def get_stats(overview: OverviewOf) -> Stats:
 
 @router.get("/healthz")
 async def healthz() -> dict[str, bool]:
-    """Confirm that this process answers; needs no thread."""
+    """Confirm that this process answers."""
     return {"ok": True}
 
 
@@ -76,7 +76,7 @@ usage_router = APIRouter(tags=["usage"])
 
 
 def _day(said: object) -> object:
-    """Reject numbers, which would mean seconds since 1970, and times, which would be reduced to their day."""
+    """Reject numbers (pydantic would read seconds since 1970) and times (it would drop the time of day)."""
     if isinstance(said, str) and not re.fullmatch(r"[0-9]{4}-[0-9]{2}-[0-9]{2}", said):
         raise ValueError("a day is written as 2026-01-31")
     return said

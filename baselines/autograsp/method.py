@@ -1,7 +1,7 @@
 """GraspIt!'s autograsp: random collision-free start, approach, closing of the fingers until contact.
 
-GraspIt! closes joints in small steps and moves back after a collision. Here step lengths follow from distances. The
-result is the same: contact within `TOUCH_M`. No step tunnels through the object."""
+GraspIt! closes joints in small steps and moves back after a collision. Here distances limit the steps, so that no step
+passes through the object. Both end in contact, here within `TOUCH_M`."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Autograsp:
             closer = HandCloser(pair, n)
             state = closer.approach(state, self.options.standoff_m)
             steps(n, "approach")
-            state = closer.close(state).state
+            state = closer.close(state)
             steps(n, "closing")
             return state
 
@@ -67,13 +67,10 @@ METHOD: Final = Method(
     uses=("face_error_m",),
 )
 
-#: Largest distance of a contact: GraspIt!'s threshold layer [m].
-TOUCH_M: Final = 2e-4
-#: Distances are capped at this [m].
-REACH_M: Final = 0.03
-#: Gap [m] below which fingers reduce each other's steps.
-MARGIN_M: Final = 0.005
-#: Share of a gap that is crossed in one step. Large distances come from a grid with errors of up to a third.
+TOUCH_M: Final = 2e-4  # largest distance of a contact: GraspIt!'s threshold layer [m]
+REACH_M: Final = 0.03  # largest distance that is computed [m]; larger ones are set to it
+MARGIN_M: Final = 0.005  # gap between two bodies below which it limits the steps of their dofs [m]
+#: Share of a gap that one step crosses. Large distances come from a grid and have errors of up to a third.
 SHARE: Final = 0.6
 #: Longest closing step [rad], and largest number of steps.
 LARGEST: Final = 0.1
@@ -108,16 +105,9 @@ def finger_groups(moves: NDArray[np.bool_]) -> NDArray[np.int32]:
     return group.astype(np.int32)
 
 
-@dataclass(frozen=True)
-class ClosedHands:
-    """Hands after closing, and why each dof stopped (B, D): 0 not stopped, 1 contact, 2 limit."""
-
-    state: HandState
-    stopped: NDArray[np.int32]
-
-
 class HandCloser:
-    """Approach and closing of up to `capacity` hands."""
+    """Approach and closing of up to `capacity` hands.
+    `stopped` (B, D) is 0 for a dof that still closes, 1 after contact, 2 at a limit or for a dof that never closes."""
 
     def __init__(self, pair: Pair, capacity: int) -> None:
         self.pair, self.capacity = pair, capacity
@@ -163,7 +153,7 @@ class HandCloser:
                 break
         return self.data.state(n)
 
-    def close(self, state: HandState) -> ClosedHands:
+    def close(self, state: HandState) -> HandState:
         """Close fingers until contact or limits; the root and dofs that do not close (spreads) do not move."""
         n, data = len(state.pivot), self.data
         data.set_state(state)
@@ -175,15 +165,10 @@ class HandCloser:
             self._launch(kernels.close, (), given, [data.active, self.stopped, data.q])
             if not data.active.numpy().any():
                 break
-        return ClosedHands(data.state(n), self.stopped.numpy()[:n].astype(np.int32))
-
-    def distances(self, state: HandState) -> Floats:
-        """Return (n, L) least distances of the bodies from the object, at most `REACH_M` [m]."""
-        self.data.set_state(state)
-        self._measure()
-        return self.near.numpy()[: len(state.pivot)].astype(float)
+        return data.state(n)
 
     def _measure(self, *, fingers: bool = False) -> None:
+        """Compute distances of the bodies from the object, and with `fingers` from each other, up to `REACH_M`."""
         m, d = self.model, self.data
         self._poses.run()
         posed = [d.active, d.body_p, d.body_q]
@@ -199,5 +184,4 @@ class HandCloser:
             self._launch(kernels.bodies_to_pieces, (m.pieces,), bodies, [self.pairs])
 
     def _launch(self, kernel: Any, dims: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch over the hands, and over further dimensions."""
         wp.launch(kernel, (self.capacity, *dims), inputs=inputs, outputs=outputs, device=self.model.device)

@@ -33,10 +33,8 @@ T0 = wp.constant(18.0)
 T_EVERY = wp.constant(30.0)
 COOL = wp.constant(0.95)
 MU = wp.constant(0.98)
-#: Probability of a new contact.
-SWAP = wp.constant(0.5)
-#: Distances are capped at this [m].
-FAR = wp.constant(1.0)
+SWAP = wp.constant(0.5)  # probability that a proposal replaces a contact
+FAR = wp.constant(1.0)  # largest distance that is computed [m]
 
 
 @wp.func
@@ -70,8 +68,8 @@ def propose(
     energy_out: wp.array2d(dtype=wp.float32),
 ):
     """Step down the gradient, redraw each contact with probability 1/2, reset energies. Launch over B.
-    The published code divides by the root mean square over its batch. Here each grasp has its own root mean squares of
-    translation, rotation and joints (columns 0 to 2 of `moment`), so that grasps of a batch are independent."""
+    The published code divides by the root mean square over its batch. Here each grasp has its own root mean squares
+    (`moment`: translation, rotation, joints), so that grasps of a batch are independent."""
     b = wp.tid()
     it = iteration_in[0]
     size = step_size(it)
@@ -252,9 +250,7 @@ def total_energy(terms: wp.array2d(dtype=wp.float32), b: wp.int32):
 @wp.func
 def accepted(rise: wp.float32, t: wp.float32, uniform: wp.float32):
     """Return 1 if the energy falls, or with probability exp(-rise / t) if it rises; else 0 (Metropolis)."""
-    if rise < 0.0:
-        return 1
-    if uniform < wp.exp(-rise / t):
+    if rise < 0.0 or uniform < wp.exp(-rise / t):
         return 1
     return 0
 
@@ -279,7 +275,7 @@ def accept(
     contact_inout: wp.array2d(dtype=wp.int32),
     taken_inout: wp.array(dtype=wp.int32),
 ):
-    """Accept or reject the proposal; accept the first (the old energy is infinite). Launch over B."""
+    """Accept or reject the proposals; the first has no rival, as the old energy is infinite. Launch over B."""
     b = wp.tid()
     rng = rng_inout[b]
     uniform = wp.randf(rng)

@@ -1,6 +1,6 @@
 """Differentiable force closure: DexGraspNet's starts around the convex hull, then annealed descent.
 
-All hands are returned; `info["passed"]` marks those that the published code would accept."""
+The planner returns all hands; `info["passed"]` marks those that the published code would accept."""
 
 from __future__ import annotations
 
@@ -39,14 +39,11 @@ from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import add_poses, add_root_gradient
 
-#: Bounds of the published code on force closure, distance and penetration.
-PASSES: Final = (0.3, 0.005, 0.001)
+PASSES: Final = (0.3, 0.005, 0.001)  # bounds of the published code on force closure, distance and penetration
 #: Distance of the palm from the hull [m]. In the published code the root, one palm length behind, is at 0.2 to 0.3 m.
 DISTANCE: Final = (0.1, 0.2)
-#: Largest tilt of the approach from the hull's normal [rad].
-TILT: Final = np.pi / 6
-#: Standard deviation of joints about the pre-shape, as a share of their range.
-POSTURE: Final = 0.1
+TILT: Final = np.pi / 6  # largest tilt of the approach from the hull's normal [rad]
+POSTURE: Final = 0.1  # standard deviation of joints about the pre-shape, as a share of their range
 
 
 class DfcOptions(Options):
@@ -69,10 +66,9 @@ class Dfc:
             descent.run(self.options.steps, steps)
             return descent.hands(), descent.energies()
 
-        found = run_parts(split_batch(wanted.count, run), work)
-        energies = np.concatenate([part[1] for part in found])
-        passed = (energies[:, :3] < np.array(PASSES)).all(axis=1)
-        return grasp_set(pair, HandState.joined([part[0] for part in found]), began, {"passed": passed.tolist()})
+        states, energies = zip(*run_parts(split_batch(wanted.count, run), work), strict=True)
+        passed = (np.concatenate(energies)[:, :3] < np.array(PASSES)).all(axis=1)
+        return grasp_set(pair, HandState.joined(states), began, {"passed": passed.tolist()})
 
 
 METHOD: Final = Method(
@@ -86,7 +82,7 @@ METHOD: Final = Method(
 
 
 def sample_starts(hand: HandModel, obj: ObjectModel, *, seed: int, batch: int, indices: range) -> HandState:
-    """Sample one start per grasp; each depends on its own index only."""
+    """Sample a start per index; it depends only on seed, batch and its index."""
     rows = [_start(hand, obj, np.random.default_rng([seed, batch, index])) for index in indices]
     return HandState(*(np.stack([row[k] for row in rows]) for k in range(3)))
 
@@ -101,8 +97,7 @@ def _start(hand: HandModel, obj: ObjectModel, rng: np.random.Generator) -> tuple
     normal = normal * np.cos(angle) + np.cross(axis, normal) * np.sin(angle)
     align = frame_along(-normal) @ frame_along(hand.palm.approach).T
     roll = quat_from_axis_angle(-normal, np.array(rng.uniform(0.0, 2 * np.pi)))
-    span = hand.upper - hand.lower
-    q = np.clip(hand.preshape + POSTURE * span * rng.normal(size=hand.dofs), hand.lower, hand.upper)
+    q = np.clip(hand.preshape + POSTURE * hand.span * rng.normal(size=hand.dofs), hand.lower, hand.upper)
     pivot = points[0] + rng.uniform(*DISTANCE) * normal - obj.centre_of_mass
     return pivot, quat_multiply(roll, quat_from_matrix(align)), q
 
@@ -112,8 +107,7 @@ Ints = NDArray[np.int32]
 #: Number of contact candidates on each link and on the palm.
 EACH: Final = 12
 ON_PALM: Final = 24
-#: Number of object samples for penetration.
-SAMPLES: Final = 2000
+SAMPLES: Final = 2000  # number of object samples for penetration
 #: Energies: force closure, distance, penetration, self-penetration, joint limits.
 TERMS: Final = 5
 CHUNK: Final = 50
@@ -137,13 +131,12 @@ def key_points(hand: HandModel) -> tuple[Ints, Floats, Ints, Ints]:
 
 
 class Descent:
-    """A batch of hands on one object."""
+    """Annealed descent of a batch of hands on one object."""
 
     def __init__(self, pair: Pair, starts: HandState, seeds: list[list[int]]) -> None:
         self.pair, self.n = pair, len(starts.pivot)
-        hand = pair.hand.model
         self.obj = pair.fine.obj.thinned(SAMPLES)
-        self.candidates = inner_side_points(hand, each=EACH, on_palm=ON_PALM)
+        self.candidates = inner_side_points(pair.hand.model, each=EACH, on_palm=ON_PALM)
         # Model of the proposals; only its kinematics is computed.
         self.model = Model.create(pair.hand, self.obj, pair.coarse.points, pair.coarse.own, pair.options)
         self.proposal = Data(self.model, self.n)
@@ -154,7 +147,6 @@ class Descent:
         with wp.ScopedDevice(self.device):
             self.rng = wp.array(random, dtype=wp.uint32)
             self._allocate(contacts)
-            self._upload(hand)
         self.proposal.set_state(starts)
         for mine, other in zip(self.state, self._proposed(), strict=True):
             wp.copy(mine, other)
@@ -169,11 +161,9 @@ class Descent:
         self.gradient = wp.zeros((n, 6 + dofs), dtype=wp.float32)
         self.moment = wp.zeros((n, 3), dtype=wp.float32)
         self.taken = wp.zeros(n, dtype=wp.int32)
-
-    def _upload(self, hand: HandModel) -> None:
         self.candidate_body = wp.array(self.candidates.body, dtype=wp.int32)
         self.candidate_position = wp.array(self.candidates.position, dtype=wp.vec3)
-        body, place, first, second = key_points(hand)
+        body, place, first, second = key_points(self.pair.hand.model)
         self.pairs = len(first)
         self.keys = [wp.array(v, dtype=wp.int32) for v in (first, second, body)] + [wp.array(place, dtype=wp.vec3)]
 
@@ -202,13 +192,14 @@ class Descent:
         return out
 
     def run(self, steps: int, tell: StepCounter) -> None:
-        """Make `steps` proposals; raises TaskCancelled through `tell`."""
+        """Make `steps` proposals. Raises TaskCancelled: through `tell`."""
         for first in range(0, steps, CHUNK):
             count = min(CHUNK, steps - first)
             self.launches.run(count)
             tell(self.n * count, "annealing")
 
     def hands(self) -> HandState:
+        """Return the accepted hands, with joints clipped to their limits."""
         for mine, other in zip(self._proposed(), self.state, strict=True):
             wp.copy(mine, other)
         found = self.proposal.state(self.n)

@@ -1,13 +1,13 @@
 """Force-based contact, relaxed by contact-invariant forces (Mordatch 2012), as in Grasp'D.
 
-The hand is fixed; the object (mass m) has one of several small velocities v_j. A hand point at distance d from the
-object's surface, dilated by r, exerts the force
+The hand is fixed; the object (mass m) has one of several small velocities v_j. Its surface is dilated by r. A hand
+point at distance d from the surface exerts the force
 
     f = -k c n - min(kf |v_t|, mu k c) v_t / |v_t|,   c = max(r - d, 0).
 
-In the relaxation every point and velocity has its own force F. Two descents alternate. F moves to the nearest forces
-that stop the object (`relax`). The hand moves so that contact forces approach F, by the gradient of sum |f - F|^2.
-Points without contact get a share of this gradient (leak), which attracts them."""
+In the relaxation every point and velocity has its own force F. Two descents alternate: F approaches the nearest forces
+that stop the object (`relax`), and the hand descends sum |f - F|^2. Points without contact get a share of this gradient
+(leak), which attracts them."""
 
 import warp as wp
 
@@ -177,7 +177,7 @@ def nearest(
     # Data out:
     least_inout: wp.array(dtype=wp.float32),
 ):
-    """Compute the least distance of each hand's points by the grid. Launch over (B, N)."""
+    """Compute the least distance of each hand's points from the object, by the grid. Launch over (B, N)."""
     b, i = wp.tid()
     body = point_body_in[i]
     x = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], point_position_in[i])

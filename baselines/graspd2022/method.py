@@ -1,6 +1,6 @@
 """Grasp'D: collision-free starts, descent with relaxed forces; no selection or repair, as published.
 
-The object is a grid of signed distances with trilinear interpolation. Its error is of second order in the cell size."""
+A grid of signed distances with trilinear interpolation represents the object."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Search:
         self.points = sample_surface(pair.hand.model, POINTS)
 
     def run(self, starts: HandState, *, steps: int, tell: StepCounter) -> tuple[HandState, Floats]:
-        """Return hands after `steps` iterations, and their force residuals (n,); 1 without contact force."""
+        """Return hands after `steps` iterations, and their `residual` (n,). Raises TaskCancelled: through `tell`."""
         n = len(starts.pivot)
         back = quat_rotate(starts.rotation, self.pair.hand.model.palm.approach)
         batch = _Batch(self, replace(starts, pivot=starts.pivot - BACKOFF_M * back), steps)
@@ -75,11 +75,9 @@ class Graspd2022:
             steps(len(indices), "starts")
             return search.run(starts, steps=self.options.steps, tell=steps)
 
-        found = run_parts(split_batch(wanted.count, run), work)
-        residual = np.concatenate([part[1] for part in found])
-        return grasp_set(
-            pair, HandState.joined([part[0] for part in found]), began, {"residual": residual.round(4).tolist()}
-        )
+        states, residuals = zip(*run_parts(split_batch(wanted.count, run), work), strict=True)
+        info: dict[str, object] = {"residual": np.concatenate(residuals).round(4).tolist()}
+        return grasp_set(pair, HandState.joined(states), began, info)
 
 
 METHOD: Final = Method(
@@ -90,8 +88,7 @@ METHOD: Final = Method(
     uses=("face_error_m",),
     quick={"steps": 60},
 )
-#: Number of hand points: the published hand has 778 vertices.
-POINTS: Final = 778
+POINTS: Final = 778  # number of hand points: the published hand has 778 vertices
 #: Published constants in SI units: stiffness, viscous friction, friction, time step, speed, mass.
 STIFFNESS: Final = 1e5
 VISCOUS: Final = 1e3
@@ -112,8 +109,7 @@ WARMUP: Final = 200
 APART_M: Final = 0.01
 BACKOFF_M: Final = 0.05
 CHUNK: Final = 25
-#: Margin of the grid around the object's box [m].
-PAD_M: Final = 0.10
+PAD_M: Final = 0.10  # margin of the grid around the object's box [m]
 
 
 def schedule(steps: int) -> Schedule:
@@ -121,7 +117,7 @@ def schedule(steps: int) -> Schedule:
     at = np.arange(steps)
     dilation = MAX_DILATION * np.clip(1.0 - at / max(0.5 * steps, 1.0), 0.0, 1.0)
     rates = np.minimum(at / WARMUP, 1.0)[:, None] * np.array(RATES)
-    # Self-collisions use the same stiffness, squared as in the loss of the other forces.
+    # The stiffness is squared, as in the loss of the other forces.
     own = np.full(steps, STIFFNESS**2)
     zero = np.zeros(steps)
     return Schedule(dilation, zero, zero, own, rates)
@@ -145,11 +141,10 @@ class _Batch:
         self.device = self.model.device
         self.physics = physics_of(pair.fine.obj.model.gyration_radius)
         velocity = SPEED * np.array([[0.0, 0, 0], [1, 1, 1], [-1, -1, -1]])
-        wanted = np.concatenate([MASS / STEP_S * velocity, np.zeros((3, 3))], axis=1)
-        self.wanted = wanted
+        self.wanted = np.concatenate([MASS / STEP_S * velocity, np.zeros((3, 3))], axis=1)
         with wp.ScopedDevice(self.device):
             self.velocity = wp.array(velocity, dtype=wp.vec3)
-            self.task = wp.array(wanted, dtype=kernels.vec6)
+            self.task = wp.array(self.wanted, dtype=kernels.vec6)
             shape = (n, POINTS, 3)
             self.force, self.first, self.largest = (wp.zeros(shape, dtype=wp.vec3) for _ in range(3))
             self.total, self.pull = (wp.zeros((n, 3), dtype=kernels.vec6) for _ in range(2))
@@ -185,7 +180,7 @@ class _Batch:
         return out
 
     def residual(self) -> Floats:
-        """Return (n,) largest relative residuals over velocities of a moving object; 1 without contact force."""
+        """Return (n,) force residuals over the wanted force, the larger of both; 1 without contact forces."""
         return self.gap.numpy()[:, 1:].max(axis=1).astype(float) / float(np.linalg.norm(self.wanted[1]))
 
 

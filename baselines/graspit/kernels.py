@@ -28,11 +28,9 @@ T0 = wp.constant(1e6)
 C = wp.constant(7.0)
 ROOT = wp.constant(1.0 / 8)
 SCALE = wp.constant(1e-6)
-#: Largest number of draws of a collision-free neighbour per step; if all fail the step does not count.
-TRIES = wp.constant(11)
-#: Largest number of draws of one variable for a value inside its bounds.
-REDRAWS = wp.constant(100)
-#: Distances are capped at this [m].
+TRIES = wp.constant(11)  # largest number of neighbours drawn per step; if all collide, the step does not count
+REDRAWS = wp.constant(100)  # largest number of draws of a variable until its value is inside its bounds
+#: Largest distance that is computed [m].
 FAR = wp.constant(1.0)
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 
@@ -118,7 +116,7 @@ def place(problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.ve
 
 @wp.func
 def clashes(problem: Problem, x: vec8):
-    """Check whether the nearest posture of the grid has a self-collision."""
+    """Return 1 if the nearest posture of the grid has a self-collision."""
     rows = problem.clash.shape[0] - 1
     columns = problem.clash.shape[1] - 1
     i = int(float(rows) * (x[6] - problem.low[6]) / wp.max(problem.high[6] - problem.low[6], 1.0e-6) + 0.5)
@@ -128,7 +126,7 @@ def clashes(problem: Problem, x: vec8):
 
 @wp.func
 def inside(problem: Problem, point: wp.vec3):
-    """Return 1 for a point inside the object; the grid decides clear cases."""
+    """Return 1 for a point inside the object; query the mesh only near the surface."""
     coarse = field_distance(problem.surface, point).distance
     if coarse > problem.surface.field_error:
         return 0
@@ -297,7 +295,7 @@ def insert_best(
     best: wp.array2d(dtype=vec8),
     best_energy: wp.array2d(dtype=wp.float32),
 ):
-    """Insert a better state into the best ones, in place of a near-duplicate, if any, or of the worst."""
+    """Insert a state into the list of the best, in place of a worse near-duplicate or of the worst state."""
     row = wp.int32(0)
     for k in range(best_energy.shape[1]):
         if best_energy[b, k] > best_energy[b, row]:
@@ -329,7 +327,7 @@ def anneal(
     body_p_out: wp.array2d(dtype=wp.vec3),
     body_q_out: wp.array2d(dtype=wp.quat),
 ):
-    """Run `rounds` rounds of a chain, fewer if its step reaches `last`. Launch over the chains."""
+    """Try `rounds` moves of a chain, fewer if its step reaches `last`. Launch over the chains."""
     b = wp.tid()
     x = state_inout[b]
     e = energy_inout[b]

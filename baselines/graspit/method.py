@@ -1,12 +1,11 @@
 """GraspIt!'s annealing: one chain per grasp over eigengrasps, then autograsp from its best state.
 
-Virtual contacts are a few points of a hand: two on each link's inner side, and some on the palm. GraspIt! has files of
-them for its own hands; here they are computed for any hand.
+Virtual contacts are a few points of a hand: two on each link's inner side, and some on the palm. GraspIt! reads them
+from files for its own hands; here they are computed for any hand.
 
-GraspIt! has two eigengrasps for the Barrett hand: spread, and closing of all fingers. It has two for its human hand:
-flexion, mainly of the knuckles, and knuckles against distal joints. It has none for Allegro or Shadow. In this module a
-hand with one closing dof per finger uses Barrett's eigengrasps. Any other hand uses the human hand's, by the position
-of each joint along its finger."""
+GraspIt! has two eigengrasps for the Barrett hand: spread, and closing of all fingers. Hands with one closing dof per
+finger use these. All other hands use the two of GraspIt!'s human hand: flexion, mainly of the knuckles, and knuckles
+against distal joints. The position of a joint along its finger selects its weight."""
 
 from __future__ import annotations
 
@@ -28,7 +27,6 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, quat_from_matrix
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
-from graspd.worker.hands.kinematics import ancestors
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
@@ -41,7 +39,7 @@ from graspd.worker.simulation.record import record_placement
 
 
 class Search:
-    """Simulated annealing of one hand on one object; chains differ only in their states."""
+    """Simulated annealing of one hand on one object."""
 
     def __init__(self, pair: Pair) -> None:
         self.pair, self.hand = pair, pair.hand.model
@@ -72,8 +70,8 @@ class Search:
 
     def run(self, seeds: list[list[int]], *, steps: int, keep: int, tell: StepCounter) -> HandState:
         """Return the `keep` best states of each chain, best first, grouped by chain.
-        `seeds` has each chain's seeds. A chain ends when the schedule's counter reaches `steps`. `tell` receives one
-        unit of work per move. Raises InputError: no free hand pose around the object. TaskCancelled: through `tell`."""
+        A chain has the seeds of a row of `seeds` and ends when its counter reaches `steps`. `tell` counts moves.
+        Raises InputError: a chain finds no collision-free start. TaskCancelled: through `tell`."""
         chains = len(seeds)
         random = np.array([np.random.SeedSequence(seed).generate_state(1)[0] for seed in seeds], np.uint32)
         with wp.ScopedDevice(self.device):
@@ -85,7 +83,8 @@ class Search:
             scratch = [wp.zeros((chains, self.hand.bodies), dtype=kind) for kind in (wp.vec3, wp.quat)]
             wp.launch(kernels.begin, chains, inputs=[self.problem, START_TRIES], outputs=[rng, state, energy, *scratch])
             if (energy.numpy() < 0).any():
-                raise InputError(f"{self.hand.name} finds no free place around {self.pair.fine.obj.model.name}")
+                obj = self.pair.fine.obj.model
+                raise InputError(f"{self.hand.name} has no collision-free start around {obj.name}")
             tell(0, "starts")
             begun, done = state.numpy(), 0
             given = [self.problem, ROUNDS, steps, ALIKE]
@@ -130,7 +129,7 @@ class Graspit:
         def work(indices: range) -> HandState:
             seeds = [[wanted.seed, wanted.batch, chain] for chain in indices]
             state = search.run(seeds, steps=self.options.steps, keep=keep, tell=steps)
-            return HandCloser(pair, len(state.pivot)).close(state).state
+            return HandCloser(pair, len(state.pivot)).close(state)
 
         states = HandState.joined(run_parts(split_batch(chains, run), work))
         return grasp_set(pair, states[: wanted.count], began, {"chains": chains, "moves": moves})
@@ -157,8 +156,7 @@ CLASH_M: Final = 2e-3
 #: Number of uniform draws for a legal start, and of rounds between two checks for cancellation.
 START_TRIES: Final = 5000
 ROUNDS: Final = 500
-#: Limit on rounds, as a multiple of the moves; rounds without a free neighbour count.
-PATIENCE: Final = 3
+PATIENCE: Final = 3  # limit on rounds, as a multiple of the moves; rounds without a free neighbour count
 #: Difference below which two states are near-duplicates, as in GraspIt!.
 ALIKE: Final = 0.2
 NOT_YET: Final = 1e9
@@ -183,7 +181,7 @@ def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
 
 
 def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
-    """Return states (chains * keep, 8), best first; the chain's last one, or its start, fills gaps."""
+    """Return states (chains * keep, 8), best first; missing ones repeat the chain's last one or its start."""
     out = np.empty_like(best)
     for c, (states, energies) in enumerate(zip(best, energy, strict=True)):
         found = [k for k in np.argsort(energies, kind="stable") if energies[k] < NOT_YET / 2]
@@ -197,20 +195,16 @@ FLEXION: Final = (1.0, 0.3, 0.15)
 SECOND: Final = (-1.0, 1.0, 0.3)
 #: Position of closing joints in the mean posture, as a share of their range (Barrett's origin: 0.79 of 2.44 rad).
 ORIGIN: Final = 0.33
-#: Largest amplitude.
-AMPLITUDE: Final = 4.0
+AMPLITUDE: Final = 4.0  # largest amplitude
 
 
 @dataclass(frozen=True)
 class Eigengrasps:
     """Postures q = origin + amplitudes @ directions, inside the joint limits."""
 
-    origin: Floats
-    """(D,)"""
-    directions: Floats
-    """(2, D)"""
-    limits: Floats
-    """(2, 2) least and largest amplitude of each direction, beyond which no joint moves"""
+    origin: Floats  # (D,)
+    directions: Floats  # (2, D)
+    limits: Floats  # (2, 2) least and largest amplitude of each direction, beyond which no joint moves
 
     def posture(self, amplitudes: Floats, hand: HandModel) -> Floats:
         return np.clip(self.origin + np.asarray(amplitudes) @ self.directions, hand.lower, hand.upper)
@@ -218,27 +212,27 @@ class Eigengrasps:
 
 def dof_ranks(hand: HandModel) -> NDArray[np.int32]:
     """Return (D,) numbers of closing dofs between each closing dof and the palm; -1 for other dofs."""
-    moved = ancestors(hand)
     first = [int(np.flatnonzero(hand.dof == d)[0]) for d in range(hand.dofs)]
     out = np.full(hand.dofs, -1, np.int32)
     for d, body in enumerate(first):
         if hand.closing[d]:
-            before = {int(hand.dof[k]) for k in np.flatnonzero(moved[body]) if k > 0} - {d}
+            before = {int(hand.dof[k]) for k in hand.chain(body)} - {d}
             out[d] = sum(hand.closing[e] != 0 for e in before)
     return out
 
 
 def eigengrasps(hand: HandModel) -> Eigengrasps:
+    """Return the two eigengrasps that the module's docstring selects for a hand."""
     place, closing = dof_ranks(hand), np.asarray(hand.closing, float)
     closes = closing != 0
     if place.max() <= 0:
         directions = np.array([(~closes).astype(float), closing])
-        if not directions[0].any():  # no spread: the first eigengrasp would be empty
+        if not directions[0].any():  # without a spread dof, use alternating closing instead
             directions[0] = closing * np.where(np.arange(hand.dofs) % 2, -1.0, 1.0)
     else:
         row = np.clip(place, 0, 2)
         directions = np.array([closing * np.array(weights)[row] * closes for weights in (FLEXION, SECOND)])
-    opened, span = np.where(closing >= 0, hand.lower, hand.upper), hand.upper - hand.lower
+    opened, span = np.where(closing >= 0, hand.lower, hand.upper), hand.span
     origin = np.where(closes, opened + ORIGIN * span * np.where(closing >= 0, 1, -1), (hand.lower + hand.upper) / 2)
     limits = np.zeros((2, 2))
     for i, direction in enumerate(directions):

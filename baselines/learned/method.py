@@ -34,8 +34,6 @@ from graspd.worker.simulation.model import Model
 
 
 class LearnedOptions(Options):
-    """Options of the method `learned`."""
-
     network: Digest = Field(description="digest of the network; on the command line its file, in a job its name")
     starts: int = Field(4, ge=1, le=32, description="starts of each grasp")
 
@@ -47,11 +45,9 @@ class LearnedPlanner:
     options: LearnedOptions
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
-        """See `worker.planners.Planner`."""
         return plan(hand, obj, wanted, run, warm=self._seeds(hand))
 
     def joined(self, hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest]) -> list[GraspSet | Exception]:
-        """See `worker.planners.port.BatchPlanner`."""
         return plan_batches(hand, obj, asked, warm=self._seeds(hand))
 
     def _seeds(self, hand: HandModel) -> Seeds:
@@ -77,37 +73,30 @@ METHOD: Final = Method(
     files={"network": cache_file},
 )
 
-#: Tried retreats along the approach of a hand in collision [m].
+#: Retreats along the approach that are tested for a hand in collision [m].
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08)
-#: Number of proposals per grasp, computed at once and divided among its starts.
-PROPOSALS: Final = 32
-#: Largest distance of a start's palm from the object's bounding ball [m].
-FAR_M: Final = 0.15
+PROPOSALS: Final = 32  # number of proposals per grasp, computed at once and divided among its starts
+FAR_M: Final = 0.15  # largest distance of a start's palm from the object's bounding ball [m]
+
+
+Generators = list[np.random.Generator]
 
 
 @dataclass(frozen=True)
 class Seeds:
-    """A `WarmStart` from a network's proposals; fast_graspd replaces starts without a free proposal."""
+    """A `WarmStart` from a network's proposals; starts of fast_graspd replace those without a free proposal."""
 
     network: ProposalNetwork
-    starts: int
-    """Starts per grasp."""
+    starts: int  # starts per grasp
 
     def adapted(self, fidelity: Fidelity) -> Fidelity:
-        """See `WarmStart`."""
         finalists = min(fidelity.finalists, self.starts)
         return fidelity.model_copy(update={"starts": self.starts, "finalists": finalists})
 
     def __call__(
-        self,
-        model: Model,
-        generators: list[np.random.Generator],
-        *,
-        each: int,
-        placed: PlacedGrasps,
-        ways: Sequence[Floats],
+        self, model: Model, generators: Generators, *, each: int, placed: PlacedGrasps, ways: Sequence[Floats]
     ) -> tuple[HandState, Floats]:
-        """See `scene_starts.clear_scene_starts`. Raises SceneError: the scenes have no table."""
+        """Return starts and depths [m], see `clear_scene_starts`. Raises SceneError: the scenes have no table."""
         scene = np.repeat(placed.index, each)
         drawn, away = self._proposed(model, generators, each, placed)
         state, depth = _clear(model, drawn, away, scene, placed)
@@ -120,9 +109,9 @@ class Seeds:
         return state, depth
 
     def _proposed(
-        self, model: Model, generators: list[np.random.Generator], each: int, placed: PlacedGrasps
+        self, model: Model, generators: Generators, each: int, placed: PlacedGrasps
     ) -> tuple[HandState, Floats]:
-        """Return open hands (n * draws) grouped by start, and retreat directions (n * draws, 3); object frame."""
+        """Return open hands (n * draws) and their retreat directions (n * draws, 3) by start; object frame."""
         hand, obj, table = model.hand.model, model.obj.model, table_height(placed.supports)
         seen, draws = SurfaceView.of(obj), max(1, PROPOSALS // each)
         pivot, rotation, q, away = [], [], [], []
@@ -145,19 +134,19 @@ class Seeds:
 
 
 def table_height(supports: Sequence[Obstacle]) -> float:
-    """Return z of the table among the supports of a scene [m].
-    Raises SceneError: there is no table, that is, no half-space below a horizontal plane."""
+    """Return z of the table among a scene's supports [m]: the highest half-space below a horizontal plane.
+    Raises SceneError: there is none."""
     heights = [float(o.planes[0, 3]) for o in supports if len(o.planes) == 1 and o.planes[0, :3] @ UP > UPRIGHT]
     if not heights:
-        raise SceneError("method learned needs an object on a table, but this scene has no table; choose fast_graspd")
+        raise SceneError("method learned needs a table, but this scene has none; choose fast_graspd")
     return max(heights)
 
 
 def _clear(
     model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: PlacedGrasps
 ) -> tuple[HandState, Floats]:
-    """Return, per start (n), the collision-free hand that retreats least, and its depth [m]; inf if none.
-    A hand that lacks clearance from obstacles is raised first."""
+    """Return for each of n starts the free hand that retreats least, and its depth [m], inf if none is free.
+    Hands without clearance from obstacles are first moved up."""
     count, probe = len(scene), Probe(model, len(scene), room=ROOM)
     draws = len(drawn.pivot) // count
     near = (np.linalg.norm(drawn.pivot, axis=1) < model.obj.model.radius + FAR_M).reshape(count, draws)
@@ -187,14 +176,14 @@ def _clear(
     return best, depth
 
 
-#: Cameras as in the pictures of a job: elevation above the table [rad]; half of the field of view [rad]; share of the
-#: field that the object's bounding ball fills; least distance to the ball [m].
+#: Cameras as in the pictures of a job: elevation above the table [rad]; half of the field of view [rad]; share of this
+#: angle that the object's bounding ball fills; least distance to the ball [m].
 ELEVATION: Final = (np.radians(18.0), np.radians(62.0))
 HALF_FIELD: Final = np.radians(20.0)
 FILL: Final = (0.7, 1.0)
 NEAREST_M: Final = 0.25
-#: Number of surface points, and of pixels across the bounding ball; each pixel shows its nearest point. A pixel covers
-#: about five visible points, so that few hidden points appear through hollow objects.
+#: Number of surface points, and of pixels across the bounding ball; each pixel shows its nearest point. About five
+#: visible points per pixel hide nearly all points behind them.
 DENSE: Final = 32768
 PIXELS: Final = 48
 
@@ -204,14 +193,12 @@ class SurfaceView:
     """Surface of an object for simulated cameras."""
 
     obj: ObjectModel
-    points: Floats
-    """(DENSE, 3) in the object frame [m]."""
-    normals: Floats
-    """(DENSE, 3) unit outward normals."""
+    points: Floats  # (DENSE, 3) in the object frame [m]
+    normals: Floats  # (DENSE, 3) unit outward normals
 
     @classmethod
     def of(cls, obj: ObjectModel) -> SurfaceView:
-        """Sample points uniformly over the area; equal objects get equal points."""
+        """Sample points uniformly over the surface's area; equal objects have equal points."""
         rng = np.random.default_rng(0)
         corners = obj.vertices[obj.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -231,7 +218,7 @@ class SurfaceView:
         return np.asarray(self._middle(pose) + distance * toward)
 
     def cloud(self, pose: Floats, camera: Floats, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Sample points and normals (count, 3) from each pixel's nearest point; the object is at `pose` (7,)."""
+        """Sample (count, 3) points [m] and normals among pixels' nearest points, with the object at `pose` (7,)."""
         points, normals = quat_rotate(pose[3:], self.points) + pose[:3], quat_rotate(pose[3:], self.normals)
         rays = points - camera
         facing = np.flatnonzero((normals * rays).sum(axis=1) < 0)

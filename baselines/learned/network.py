@@ -29,8 +29,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, cross, quat_from_matrix, quat_to_matrix
 from graspd.service.store.network_file import BLOCKS, CONDITION, ENCODER, POSE, Floats32, ProposalNetwork, to_bytes
 
-#: Unit of lengths in the encoder's input and in the condition [m].
-LENGTH_M: Final = 0.1
+LENGTH_M: Final = 0.1  # unit of lengths in the encoder's input and in the condition [m]
 #: Matrix products are split into parts of 32 rows and at most this many multiplications. OpenBLAS computes such a part
 #: on one thread; other sizes or splits would round differently. A proposal is thus independent of the number of
 #: proposals and of the machine's cores.
@@ -41,25 +40,20 @@ _TINY: Final = 1e-6
 
 @dataclass(frozen=True)
 class Proposals:
-    """n grasps in the cloud's frame; joints may exceed their limits, because the network has no limits."""
+    """n grasps in the cloud's frame; joints may exceed their limits, which the network does not know."""
 
-    hand_pose: Floats
-    """(n, 7) pose of the hand's root link at the grasp: x y z [m], quaternion w x y z."""
-    approach: Floats
-    """(n, 3) unit direction of the approach, from the standoff to the pregrasp."""
-    joints: Floats
-    """(n, J) joint positions at the grasp [rad or m]."""
-    pregrasp: Floats
-    """(n, J)"""
-    squeeze: Floats
-    """(n, J)"""
+    hand_pose: Floats  # (n, 7) pose of the hand's root link at the grasp: x y z [m], quaternion w x y z
+    approach: Floats  # (n, 3) unit direction of the approach, from the standoff to the pregrasp
+    joints: Floats  # (n, J) joint positions at the grasp [rad or m]
+    pregrasp: Floats  # (n, J)
+    squeeze: Floats  # (n, J)
 
     def __len__(self) -> int:
         return len(self.hand_pose)
 
 
 def save(network: ProposalNetwork, path: Path) -> None:
-    """Write a network's file. Raises InputError: `service.store.network_file.from_bytes` would refuse it."""
+    """Write a network's file. Raises InputError: the network is invalid, see `to_bytes`."""
     path.write_bytes(to_bytes(network))
 
 
@@ -75,17 +69,11 @@ def propose(
     spread: float = 1.0,
 ) -> Proposals:
     """Propose grasps for one cloud. The first proposals do not depend on `count`.
-    Raises InputError: the cloud or the network's output is not finite.
+    Raises InputError: the cloud is empty or has another shape, or a number in it or in the output is not finite.
 
-    Args:
-        network: network of the hand.
-        points: (P, 3) visible points of the object, in a frame with z up [m].
-        normals: (P, 3) unit normals, toward the camera.
-        table_height: z of the table [m].
-        count: number of proposals.
-        rng: source of the noise.
-        label: 1 for grasps that hold, 0 for grasps that fail.
-        spread: standard deviation of the noise; 1 as in training. Below 1, grasps are likelier and less diverse."""
+    `points` (P, 3) are visible points of the object [m] and `normals` (P, 3) unit normals toward the camera, in a frame
+    with z up; `table_height` is z of the table [m]. `label` is 1 for grasps that hold, 0 for grasps that fail. `spread`
+    is the standard deviation of the noise: 1 as in training, below 1 for likelier and less diverse grasps."""
     inputs, anchor = cloud_inputs(points, normals, table_height)
     condition = conditions(network, inputs[None], np.array([anchor[2] - table_height]), label)
     noise = (spread * rng.standard_normal((count, network.row_size))).astype(np.float32)
@@ -137,7 +125,7 @@ def flow(network: ProposalNetwork, noise: Floats32, condition: Floats32) -> Floa
 
 
 def encode(proposals: Proposals, anchor: ArrayLike) -> Floats:
-    """Return grasp rows (n, D), not standardised: input of `decode`, and training target."""
+    """Return rows (n, D) of grasps before standardisation: input of `decode`, and training target."""
     position = proposals.hand_pose[:, :3] - np.asarray(anchor, float)
     rotation = quat_to_matrix(proposals.hand_pose[:, 3:])
     joints = proposals.joints
@@ -147,7 +135,7 @@ def encode(proposals: Proposals, anchor: ArrayLike) -> Floats:
 
 
 def decode(rows: ArrayLike, anchor: ArrayLike) -> Proposals:
-    """Return grasps of rows (n, D) with one anchor (3,) or one per row (n, 3). Rotations by Gram-Schmidt."""
+    """Return the grasps of rows (n, D); `anchor` (3,) or (n, 3). Gram-Schmidt makes rotations orthogonal."""
     x = np.asarray(rows, float)
     joints, opened, pressed = np.split(x[:, POSE:], 3, axis=1)
     first = _unit(x[:, 3:6], np.array([1.0, 0, 0]))
@@ -191,7 +179,7 @@ class _Layer:
 
 
 def _layers(network: ProposalNetwork) -> Mapping[str, _Layer]:
-    """Return the layers by name, split once per network."""
+    """Return the layers by name, cached in the network."""
     if "layers" not in vars(network):
         names = [name.removesuffix(".bias") for name in network.weights if name.endswith(".bias")]
         vars(network)["layers"] = {name: _Layer.of(network, name) for name in names}

@@ -20,11 +20,9 @@ class Carrier:
     """The arm that carries the hand, its base, and its motions."""
 
     arm: Arm
-    base: Floats
-    """(7,) pose of the base in the frame of the grasps."""
+    base: Floats  # (7,) pose of the base in the frame of the grasps
     world: ArmScene
-    paths: list[list[Path]]
-    """Motions of each grasp; joints are the arm's, then the hand's."""
+    paths: list[list[Path]]  # motions of each grasp; joints are the arm's, then the hand's
 
 
 @dataclass(frozen=True)
@@ -32,8 +30,7 @@ class Bundle:
     """Grasps with their trajectories, ready to be written."""
 
     found: Executions
-    trajectories: list[RobotTrajectory]
-    """One per grasp; joints are the arm's, if there is one, then the hand's."""
+    trajectories: list[RobotTrajectory]  # one per grasp; joints are the arm's, if there is one, then the hand's
     description: Description
     carrier: Carrier | None = None
 

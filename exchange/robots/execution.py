@@ -26,8 +26,7 @@ from graspd.worker.simulation.environment import STANDOFF_M, PlacedGrasps
 #: Postures of a grasp in order. The open hand moves from `standoff` to `arrival`, takes the shape of `pregrasp`, closes
 #: to `grasp`, is commanded to `squeeze`, and rises to `lift`.
 POSTURES: Final = ("standoff", "arrival", "pregrasp", "grasp", "squeeze", "lift")
-#: Motions between consecutive postures.
-PHASES: Final = ("approach", "shape", "close", "squeeze", "lift")
+PHASES: Final = ("approach", "shape", "close", "squeeze", "lift")  # motions between consecutive postures
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,7 @@ class ToolFrame:
     """A frame fixed to the hand's root link; robots are commanded by the pose of this frame."""
 
     name: str
-    pose: Floats
-    """(7,) in the frame of the root link."""
+    pose: Floats  # (7,) in the frame of the root link
 
 
 @dataclass(frozen=True)
@@ -48,22 +46,18 @@ class Executions:
     obj: ObjectModel
     tool: ToolFrame
     frame: str
-    rows: NDArray[np.intp]
-    """(N,) row of each grasp in its shard."""
-    object_pose: Floats
-    """(N, 7) poses of the object at rest."""
+    rows: NDArray[np.intp]  # (N,) row of each grasp in its shard
+    object_pose: Floats  # (N, 7) poses of the object at rest
     postures: dict[str, Posture]
     """N postures for each name in `POSTURES`; hand poses are those of the root link."""
-    placed: PlacedGrasps | None
-    """Scene of each grasp, if there are scenes."""
-    quality: dict[str, NDArray[Any]]
-    """(N,) verdicts and metrics: valid, success, epsilon."""
+    placed: PlacedGrasps | None  # scene of each grasp, if there are scenes
+    quality: dict[str, NDArray[Any]]  # (N,) verdicts and metrics: valid, success, epsilon
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def tool_pose(self, posture: str) -> Floats:
-        """Return (N, 7) tool frames in a posture."""
+        """Return (N, 7) poses of the tool frame in a posture of `POSTURES`."""
         return compose(self.postures[posture].hand_pose, self.tool.pose)
 
     @property
@@ -95,8 +89,8 @@ def executions(
     tool: ToolFrame,
     quality: dict[str, NDArray[Any]],
 ) -> Executions:
-    """Return grasps with their trajectories in a scene, or with straight approaches that are planned here.
-    Grasps without such an approach are left out. Raises InputError: no grasp has one."""
+    """Return grasps with their trajectories in scenes, or with straight approaches that are planned here.
+    Grasps whose approach is not free are omitted. Raises InputError: this holds for all grasps."""
     frame, at = "object", np.tile(IDENTITY_POSE, (len(grasps), 1))
     free = np.ones(len(grasps), bool)
     if placed is None or grasps.approach is None or grasps.coming is None or grasps.lift is None:
@@ -106,15 +100,9 @@ def executions(
     else:
         frame, at = "scene", np.asarray(placed.object_pose, float)[placed.index]
         coming, ends, lift = grasps.coming, (grasps.approach[:, 0], grasps.approach[:, -1]), grasps.lift
-    found = {
-        "standoff": Posture(ends[0], coming),
-        "arrival": Posture(ends[1], coming),
-        "pregrasp": grasps.pregrasp,
-        "grasp": grasps.grasp,
-        "squeeze": grasps.squeeze,
-        "lift": lift,
-    }
-    postures = {name: Posture(compose(at, part.hand_pose), part.joint_positions) for name, part in found.items()}
+    parts = [*(Posture(end, coming) for end in ends), grasps.pregrasp, grasps.grasp, grasps.squeeze, lift]
+    placed_parts = (Posture(compose(at, part.hand_pose), part.joint_positions) for part in parts)
+    postures = dict(zip(POSTURES, placed_parts, strict=True))
     whole = Executions(hand, obj, tool, frame, np.asarray(rows, np.intp), at, postures, placed, dict(quality))
     if not free.any():
         raise InputError(
@@ -129,12 +117,12 @@ def posed_bodies(found: Executions, posture: str, row: int) -> Floats:
     return np.asarray(body_poses(found.hand, part.hand_pose[row], part.joint_positions[row])[0])
 
 
-#: Tolerance of a quaternion's length around 1.
-_SLACK = 1e-2
+_SLACK = 1e-2  # tolerance of a quaternion's length around 1
 
 
 def parse_pose(text: str, what: str) -> Floats:
-    """Parse a pose (7,) `x y z qw qx qy qz` with x y z in metres, separated by spaces or commas."""
+    """Parse a pose (7,) `x y z qw qx qy qz` with x y z in metres, separated by spaces or commas.
+    Raises InputError, with the option `what`: the text is no pose."""
     try:
         values = np.array([float(part) for part in text[:400].replace(",", " ").split()])
     except ValueError:
@@ -149,8 +137,8 @@ def parse_pose(text: str, what: str) -> Floats:
 
 
 def tool_frame(text: str | None, root_link: str, links: Mapping[str, tuple[int, Floats]]) -> ToolFrame:
-    """Return the tool frame: a link that no finger moves, or a pose in the root link's frame (default).
-    `links` has body and pose of each link, see `Description`."""
+    """Return the tool frame `text`: a link that no finger moves, or a pose in the root link's frame; default: root.
+    `links` has body and pose of each link, see `Description`. Raises InputError: `text` is neither."""
     if not text or text == root_link:
         return ToolFrame(root_link, IDENTITY_POSE.copy())
     if text in links:
@@ -193,10 +181,8 @@ _STEEPEST: Final = 15 / 8
 class Limits:
     """Velocity limits of joints."""
 
-    velocity: Floats
-    """(J,) [rad/s or m/s]"""
-    assumed: tuple[str, ...]
-    """Joints without a stated limit."""
+    velocity: Floats  # (J,) [rad/s or m/s]
+    assumed: tuple[str, ...]  # joints without a stated limit
 
 
 @dataclass(frozen=True)
@@ -204,10 +190,8 @@ class Path:
     """A motion of hand and joints without times: M points at equal shares of the path."""
 
     phase: str
-    hand_pose: Floats
-    """(M, 7)"""
-    joints: Floats
-    """(M, J)"""
+    hand_pose: Floats  # (M, 7)
+    joints: Floats  # (M, J)
 
 
 @dataclass(frozen=True)
@@ -215,16 +199,11 @@ class RobotTrajectory:
     """K points of all motions of a grasp, with times."""
 
     joint_names: tuple[str, ...]
-    phase: tuple[str, ...]
-    """(K,) motion to which each point belongs."""
-    time: Floats
-    """(K,) times since the start [s]."""
-    hand_pose: Floats
-    """(K, 7) poses of the root link."""
-    joints: Floats
-    """(K, J)"""
-    velocity: Floats
-    """(K, J) joint velocities, by differences."""
+    phase: tuple[str, ...]  # (K,) motion to which each point belongs
+    time: Floats  # (K,) times since the start [s]
+    hand_pose: Floats  # (K, 7) poses of the root link
+    joints: Floats  # (K, J)
+    velocity: Floats  # (K, J) joint velocities, by differences
 
 
 def hand_limits(hand: HandModel) -> Limits:
@@ -248,9 +227,8 @@ def straight_paths(found: Executions, row: int, points: int = 2) -> list[Path]:
 
 
 def time_motions(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, speed: float) -> RobotTrajectory:
-    """Time the motions in sequence, each at rest at both ends; each starts at the end of the previous one.
-    `velocity` (J,) has the limits of the joints [rad/s or m/s]. `speed`, above 0 and at most 1, is a factor on these
-    limits and on those of the hand."""
+    """Return the timed sequence of motions, each from rest to rest.
+    `velocity` (J,) has the joints' limits [rad/s or m/s]; `speed`, in (0, 1], scales these and the hand's limits."""
     phase, time, pose, joints = [paths[0].phase], [0.0], [paths[0].hand_pose[:1]], [paths[0].joints[:1]]
     for path in paths:
         seconds = max(SHORTEST_S, _STEEPEST * _shortest_duration(path, velocity) / speed)

@@ -1,7 +1,6 @@
 """Grasps as `moveit_msgs/Grasp` and `RobotTrajectory` messages in YAML, with URDFs of hand and object.
 
-`grasp_pose` is the pose of the tool frame, which is MoveIt's end-effector link. Poses and directions are in `frame_id`.
-ROS quaternions are x y z w. `effort` [N m or N] of the squeeze is stiffness times the distance from the grasp."""
+Poses are those of the tool frame, MoveIt's end-effector link. `effort` is stiffness times distance from the grasp."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ from graspd.exchange.robots.bundle import Bundle, dump_yaml, numbers
 from graspd.exchange.robots.execution import RobotTrajectory
 from graspd.service.model.transforms import Floats
 
-#: Share of a straight motion that must be possible before MoveIt attempts a grasp.
+#: Share of a straight motion that MoveIt must be able to make for a grasp (`min_distance`).
 LEAST_SHARE: Final = 0.5
 
 
@@ -105,29 +104,27 @@ def _duration(seconds: float) -> dict[str, int]:
 
 
 def _trajectory(bundle: Bundle, path: RobotTrajectory) -> dict[str, Any]:
-    """Return a RobotTrajectory: the joints, and the tool frame's path as a floating joint."""
+    """Return a RobotTrajectory with the joints, and with the tool frame's path as a floating joint."""
     kept = [k for k, name in enumerate(path.joint_names) if name not in bundle.description.mimics]
     names = [path.joint_names[k] for k in kept]
     points = [
         _point(joints[kept], time, rate[kept])
         for joints, time, rate in zip(path.joints, path.time, path.velocity, strict=True)
     ]
-    ways = []
+    ways: list[dict[str, Any]] = []
     for pose, time in zip(map(_pose, bundle.tool_in_frame(path.hand_pose)), path.time, strict=True):
         transform = {"translation": pose["position"], "rotation": pose["orientation"]}
         empty: dict[str, list[float]] = {"velocities": [], "accelerations": []}
         ways.append({"transforms": [transform], **empty, "time_from_start": _duration(time)})
-    floating = {"header": _header(bundle), "joint_names": [bundle.found.tool.name], "points": ways}
+    floating = _joint_trajectory(bundle, [bundle.found.tool.name], ways)
     return {"joint_trajectory": _joint_trajectory(bundle, names, points), "multi_dof_joint_trajectory": floating}
 
 
 def _hand(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
-    written = []
     for name, data in files.items():
-        written.append(folder / name)
-        written[-1].parent.mkdir(parents=True, exist_ok=True)
-        written[-1].write_bytes(data)
-    return written
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+    return [folder / name for name in files]
 
 
 def _object(bundle: Bundle, folder: Path) -> list[Path]:

@@ -1,7 +1,7 @@
 """Grasps as MuJoCo scenes with a key frame per posture: the validator's scene, and one with the arm.
 
-The world is the frame of the grasps, z up in a scene. A mocap body leads the hand's root. Position actuators have the
-names of the degrees of freedom. Gravity acts only in scenes with supports, and not on the hand."""
+The world is the frame of the grasps, z up in a scene. A weld to a mocap body moves the hand's root. Position actuators
+have the names of the degrees of freedom. Gravity acts only in scenes with supports, and not on the hand."""
 
 from __future__ import annotations
 
@@ -25,12 +25,11 @@ from graspd.worker.validation.model import MujocoOptions, Scene, build, scene_sp
 
 #: Colours of the hand, the object, and everything else.
 _COLOURS: Final = ("0.36 0.45 0.58 1", "0.87 0.45 0.2 1", "0.75 0.75 0.72 1")
-#: Attributes of MJCF that have other names in `MjSpec`.
-_SPEC_NAMES: Final = {"vertex": "uservert"}
+_SPEC_NAMES: Final = {"vertex": "uservert"}  # attributes of MJCF that have other names in `MjSpec`
 
 
 def write(bundle: Bundle, folder: Path) -> list[Path]:
-    """Write a self-contained `scene.xml`, `replay.py` to validate its grasps and, with an arm, `arm.xml`."""
+    """Write `scene.xml`, `replay.py`, which validates its grasps, and for an arm `arm.xml`."""
     found, pieces = bundle.found, decompose(bundle.found.obj)
     folder.mkdir(parents=True, exist_ok=True)
     around = ((), ()) if found.placed is None else (found.placed.supports, found.placed.neighbours)
@@ -46,9 +45,8 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
     site = {"name": "object_frame", "pos": element_text(-scene.centre), "size": "0.002", "group": "4"}
     SubElement(only_element(tree, ".//body[@name='object']"), "site", site)
     _set_physics(tree, found)
-    add_appearance(
-        tree, found, ("body0", "object", "supports", *(f"neighbour{k}" for k in range(len(scene.neighbours))))
-    )
+    neighbours = (f"neighbour{k}" for k in range(len(scene.neighbours)))
+    add_appearance(tree, found, ("body0", "object", "supports", *neighbours))
     keys = SubElement(tree, "keyframe")
     for row, posture in product(range(len(found)), POSTURES):
         SubElement(keys, "key", {"name": f"{bundle.name(row)}/{posture}", **_key_frame(found, scene, posture, row)})
@@ -61,7 +59,7 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
 
 
 def _restore_digits(tree: Element, spec: Any) -> None:
-    """Restore all digits of numbers: MuJoCo writes six, but smaller differences can decide verdicts."""
+    """Write numbers with all digits, as differences below MuJoCo's six digits can change verdicts."""
     for tag in ("body", "joint", "geom", "mesh"):
         for element in tree.iter(tag):
             source = getattr(spec, tag)(element.get("name")) if element.get("name") else None
@@ -92,7 +90,7 @@ def _set_physics(tree: Element, found: Executions) -> None:
 
 
 def add_appearance(tree: Element, found: Executions, names: tuple[str, ...]) -> None:
-    """Add colours to the bodies `names`, a light, and a default view; physics stays the same."""
+    """Add colours to the bodies `names`, a light, and a default view, without a change of physics."""
     for name, colour in zip_longest(names, _COLOURS[: len(names)], fillvalue=_COLOURS[-1]):
         for body in tree.findall(f".//body[@name='{name}']"):
             for geom in body.iter("geom"):
@@ -108,7 +106,7 @@ def add_appearance(tree: Element, found: Executions, names: tuple[str, ...]) -> 
 
 
 def _key_frame(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, str]:
-    """Return state and targets of a key frame; in squeeze and lift the fingers' state is the grasp."""
+    """Return state and targets of a key frame; the fingers' state in squeeze and lift is that of the grasp."""
     command = found.postures[posture]
     stands = found.postures["grasp"] if posture in ("squeeze", "lift") else command
     pose = command.hand_pose[row]
@@ -122,16 +120,12 @@ def _key_frame(found: Executions, scene: Scene, posture: str, row: int) -> dict[
         rest = found.placed.neighbour_pose[found.placed.index[row], k]
         qpos[free.qpos : free.qpos + 7] = compose(rest, np.array([*free.centre, 1, 0, 0, 0]))
     control = scene.controls(command.joint_positions[row])
-    return {
-        "qpos": element_text(qpos),
-        "ctrl": element_text(control),
-        "mpos": element_text(pose[:3]),
-        "mquat": element_text(pose[3:]),
-    }
+    values = {"qpos": qpos, "ctrl": control, "mpos": pose[:3], "mquat": pose[3:]}
+    return {name: element_text(value) for name, value in values.items()}
 
 
 def _names(hand: HandModel) -> Mapping[str, str]:
-    """Map the validator's names to the hand's own; reserved ones (`taken`) get the prefix `hand_`."""
+    """Map the validator's names to the hand's own, with the prefix `hand_` if they are reserved (`taken`)."""
     taken = {"object", "supports", "root", "mocap", "world"}
     found: dict[str, str] = {}
     for prefix, names in (("body", enumerate(hand.body_names)), ("dof", enumerate(hand.dof_names))):
@@ -191,7 +185,7 @@ def _add_arm_keys(tree: Element, bundle: Bundle, carrier: Carrier) -> None:
 
 
 def _arm_names(bundle: Bundle, carrier: Carrier) -> dict[str, str]:
-    """Map body keys to unique names; a reserved or repeated name gets the prefix `arm_` or `hand_`."""
+    """Map names in the scene to the links' own, with the prefix `arm_` or `hand_` if reserved or repeated."""
     found: dict[str, str] = {}
     taken = {"object", "world", "flange"}
     for prefix, model in (("arm", carrier.arm.model), ("hand", bundle.found.hand)):

@@ -23,29 +23,23 @@ from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.rendering.hands import drawn_bodies, hand_parts
 from graspd.worker.simulation.environment import Obstacle
 
-#: From z up to glTF's y up: a quarter turn about x, as x y z w.
+#: Rotation from z up to glTF's y up, as x y z w.
 _UPRIGHT: Final = [-float(np.sqrt(0.5)), 0.0, 0.0, float(np.sqrt(0.5))]
 
 
 def write_glb(bundle: Bundle, folder: Path) -> list[Path]:
-    """Write `GRASP.glb`: nodes have the names of the hand's links, the object, supports, and `tool_frame`."""
+    """Write `GRASP.glb` with a node for each link, the object, each support and `tool_frame`."""
     folder.mkdir(parents=True, exist_ok=True)
     found, written = bundle.found, []
     moving, thing, standing = hand_meshes(found), object_mesh(found), support_meshes(found)
     for row in range(len(found)):
         document = Document()
         nodes: list[dict[str, Any]] = [{"name": bundle.name(row), "rotation": _UPRIGHT}]
-
-        def add(solid: Solid, pose: Floats | None, document: Document = document, nodes: list[Any] = nodes) -> None:
+        bodies = posed_bodies(found, "grasp", row)
+        poses = [*(bodies[solid.body] for solid in moving), found.object_pose[row], *(None for _ in standing)]
+        for solid, pose in zip([*moving, thing, *standing], poses, strict=True):
             primitive = document.add_triangles(solid.vertices, solid.faces, solid.normals, solid.colour)
             nodes.append({"name": solid.name, "mesh": document.add_mesh([primitive]), **_placed(pose)})
-
-        bodies = posed_bodies(found, "grasp", row)
-        for solid in moving:
-            add(solid, bodies[solid.body])
-        add(thing, found.object_pose[row])
-        for solid in standing:
-            add(solid, None)
         nodes.append({"name": "tool_frame", **_placed(found.tool_pose("grasp")[row])})
         nodes[0]["children"] = list(range(1, len(nodes)))
         said = {"kind": "grasp", "row": int(found.rows[row]), "frame": found.frame, "tool_frame": found.tool.name}
@@ -63,8 +57,7 @@ def _placed(pose: Floats | None) -> dict[str, Any]:
 Colour = tuple[float, float, float]
 OBJECT_COLOUR: Final[Colour] = (0.72, 0.2, 0.04)
 SUPPORT_COLOUR: Final[Colour] = (0.5, 0.5, 0.47)
-#: Width and thickness of the slab that shows a half-space [m].
-SLAB_M: Final = (1.0, 0.02)
+SLAB_M: Final = (1.0, 0.02)  # width and thickness of the slab that shows a half-space [m]
 
 
 @dataclass(frozen=True)
@@ -74,16 +67,13 @@ class Solid:
     name: str
     vertices: Floats
     faces: Ints
-    normals: Floats
-    """(F, 3, 3) unit normals of the corners of faces."""
-    colour: Colour
-    """Linear RGB, 0 .. 1."""
-    body: int | None = None
-    """Body of the hand to which the mesh belongs; None for the object and supports."""
+    normals: Floats  # (F, 3, 3) unit normals of the corners of faces
+    colour: Colour  # linear RGB, 0 .. 1.
+    body: int | None = None  # body of the hand to which the mesh belongs; None for the object and supports
 
 
 def hand_meshes(found: Executions) -> list[Solid]:
-    """Return the hand's visible meshes in their bodies' frames; further meshes of a body are numbered."""
+    """Return the hand's visible meshes in their bodies' frames; a body's second and further meshes are numbered."""
     bodies, made = drawn_bodies(found.hand), []
     for number, part in enumerate(hand_parts(found.hand)):
         before = bodies[:number].count(bodies[number])
@@ -123,11 +113,12 @@ def _corners(support: Obstacle, middle: Floats) -> Floats:
     return np.array([foot + width * (a * across + b * beside) + thickness * c * normal for a, b, c in ends])
 
 
-RATE: Final = 24.0
+RATE: Final = 24.0  # time codes per second
 
 
 def write_usd(bundle: Bundle, folder: Path) -> list[Path]:
-    """Write `GRASP.usd` with `/World/HAND/LINK`, `/World/OBJECT` and `/World/scene`."""
+    """Write `GRASP.usd` with `/World/HAND/LINK`, `/World/OBJECT` and `/World/scene`.
+    Raises InputError: usd-core is missing."""
     try:
         from pxr import Usd, UsdGeom
     except ImportError:
@@ -148,7 +139,7 @@ def write_usd(bundle: Bundle, folder: Path) -> list[Path]:
         object_prim, hand_prim = bundle.prims
         root = f"/World/{hand_prim}"
         UsdGeom.Xform.Define(stage, root)
-        # The hand's joints are the last columns of the trajectory.
+        # Joints of the arm, if any, come before the hand's.
         joints = trajectory.joints[:, -len(found.hand.joint_names) :]
         bodies, times = body_poses(found.hand, trajectory.hand_pose, joints), RATE * trajectory.time
         at_grasp = posed_bodies(found, "grasp", row)

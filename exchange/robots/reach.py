@@ -1,7 +1,7 @@
 """An arm with a hand, and grasps that it can execute: inverse kinematics, limits, MuJoCo collisions.
 
-Inverse kinematics are differential, by mink. Each step is a quadratic program in the joints' increments that respects
-the joints' limits. Between consecutive poses of the trajectory the arm must not jump."""
+The library mink solves inverse kinematics by differential steps, each a quadratic program within the joints' limits. An
+arm that jumps between consecutive poses of the trajectory cannot execute the grasp."""
 
 from __future__ import annotations
 
@@ -36,20 +36,17 @@ from graspd.worker.validation.model import add_mesh, add_shape, add_support
 class Arm:
     """The chain of an arm with all its links, except links below the mount."""
 
-    model: HandModel
-    """Bodies, joints, limits and convex pieces; it has no palm and no fingers."""
+    model: HandModel  # bodies, joints, limits and convex pieces; it has no palm and no fingers
     mount: str
     mount_body: int
-    mount_pose: Floats
-    """(7,) pose of the mount link in its body's frame."""
-    hand_pose: Floats
-    """(7,) pose of the hand's root link in the mount link's frame."""
+    mount_pose: Floats  # (7,) pose of the mount link in its body's frame
+    hand_pose: Floats  # (7,) pose of the hand's root link in the mount link's frame
 
 
 def read_arm(path: str | pathlib.Path, mount: str, hand_pose: Floats) -> Arm:
-    """Read the arm of a URDF, its folder or a ZIP.
-    Links below the mount, such as a gripper, are omitted. Joints that do not lead to the mount are fixed at zero, or at
-    the nearest value inside their limits."""
+    """Read an arm from a URDF, its folder or a ZIP, without links below the mount, such as a gripper.
+    Joints that do not lead to the mount are fixed at zero, or at the nearest value inside their limits. Raises
+    InputError: there is no link `mount`, or no joint moves it."""
     name, files, stated = files_from_path(path)
     source = HandSource.read(files, stated, name=name, digest=digest_files(AssetKind.HAND, files))
     robot = source.robot
@@ -100,12 +97,12 @@ def read_description(files: Mapping[str, bytes], options: Mapping[str, Any] | No
 #: Tolerance of the hand's pose [m, rad].
 NEAR_M: Final = 1e-4
 NEAR_RAD: Final = 1e-3
-#: Number of start postures of the arm in the search for the grasp, and of steps of each search.
+#: Number of the arm's start postures for a grasp, and of solver steps from each.
 STARTS: Final = 24
 STEPS: Final = 80
 #: Largest motion of a joint between consecutive points of the trajectory, 5 mm apart [rad or m].
 JUMP: Final = 0.25
-#: Number of points of each long motion, and of each motion that mainly moves the fingers.
+#: Number of points of each motion of `_LONG_PHASES`, and of each other motion, which mainly moves the fingers.
 LONG: Final = 21
 SHORT: Final = 5
 _LONG_PHASES: Final = ("approach", "lift")
@@ -126,10 +123,10 @@ class ReachResult:
 
 
 class ReachSearch:
-    """Search for motions of one arm with one hand around one object. Not thread-safe."""
+    """Search for motions of one arm with one hand around one object. Not thread-safe.
+    Raises InputError: mink is not installed."""
 
     def __init__(self, arm: Arm, base: Floats, found: Executions, pieces: ConvexPieces) -> None:
-        """Raise InputError if mink is not installed."""
         try:
             import mink
         except ImportError:
@@ -145,7 +142,7 @@ class ReachSearch:
         self._order = np.array([int(self._model.joint(f"arm{b}").qposadr[0]) for b in arm.model.joint_body], np.intp)
 
     def all(self, wanted: int = 0) -> ReachResult:
-        """Search grasps in their order: all, or until `wanted` (above 0) are executable."""
+        """Search motions for all grasps in their order, or until `wanted` (if above 0) are executable."""
         reached = ReachResult()
         for row in range(len(self.found)):
             reached.candidates += 1
@@ -160,7 +157,7 @@ class ReachSearch:
         return reached
 
     def one(self, row: int) -> tuple[list[Path] | None, str]:
-        """Return the motions of one grasp, or None and the reason why the best start failed."""
+        """Return the motions of one grasp, or None and the reason of the start that came farthest."""
         long, short = (straight_paths(self.found, row, points) for points in (LONG, SHORT))
         ways = [a if a.phase in _LONG_PHASES else b for a, b in zip(long, short, strict=True)]
         rng, farthest, reason = np.random.default_rng(row), -1, ""
@@ -219,8 +216,8 @@ class ReachSearch:
         for _ in range(steps):
             error = task.compute_error(configuration)
             if np.linalg.norm(error[:3]) < NEAR_M and np.linalg.norm(error[3:]) < NEAR_RAD:
-                found = self.arm.model.reduce(configuration.q[self._order])
-                return found if self._inside(found) else None
+                found, arm = self.arm.model.reduce(configuration.q[self._order]), self.arm.model
+                return found if ((found >= arm.lower - 1e-6) & (found <= arm.upper + 1e-6)).all() else None
             try:
                 velocity: Any = mink.solve_ik(
                     configuration, [task], 1.0, solver="daqp", damping=1e-6, limits=self._limits
@@ -229,10 +226,6 @@ class ReachSearch:
                 return None
             configuration.integrate_inplace(velocity, 1.0)
         return None
-
-    def _inside(self, q: Floats) -> bool:
-        arm = self.arm.model
-        return bool((q >= arm.lower - 1e-6).all() and (q <= arm.upper + 1e-6).all())
 
     def _collision(self, joined: list[Floats], ways: list[Path], row: int) -> str:
         """Return the first colliding pair of bodies on the trajectory; empty without collision."""
@@ -247,13 +240,11 @@ class ReachSearch:
         return ""
 
 
-#: A pair of bodies in contact in at least this share of random postures is excluded: hulls exceed their meshes.
+#: Share of random postures from which on a pair in contact is excluded, because hulls exceed their meshes.
 ALWAYS: Final = 0.95
 SAMPLES: Final = 100
-#: Name of the frame that carries the hand.
-MOUNT: Final = "mount"
-#: The arm is tested against everything. Hand, object and supports are tested only against the arm: their own pairs were
-#: tested before.
+MOUNT: Final = "mount"  # name of the frame that carries the hand
+#: Only pairs with the arm are tested, because trajectories are already free of other collisions.
 _ARM: Final = {"contype": 1, "conaffinity": 1}
 _OTHER: Final = {"contype": 0, "conaffinity": 1}
 
@@ -297,7 +288,7 @@ class ArmScene:
         self.hand_qpos = _addresses(self.model, hand, "hand")
 
     def touches(self, arm_joints: Floats, hand_joints: Floats, object_pose: Floats) -> str:
-        """Return the colliding pair at arm dofs (A,), hand joints (J,), object pose (7,); empty if none."""
+        """Return a colliding pair at arm dofs (A,), hand joints (J,) and object pose (7,); empty if there is none."""
         self._put(self.model, self.data, arm_joints, hand_joints)
         self.data.mocap_pos[0], self.data.mocap_quat[0] = object_pose[:3], object_pose[3:]
         mujoco.mj_kinematics(self.model, self.data)

@@ -27,7 +27,7 @@ PUSHES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 
 
 class Replay:
-    """One scene, stepped grasp by grasp; `watch` is called after every step."""
+    """Simulation of a scene's grasps; `watch` is called after every step."""
 
     def __init__(self, path: Any, full: bool = False, watch: Any = None) -> None:
         self.model = mujoco.MjModel.from_xml_path(str(path))
@@ -44,11 +44,8 @@ class Replay:
             if self.model.body(body).name.startswith("neighbour") and self.model.body(body).jntnum[0] == 1
         ]
         self.falls = bool(np.linalg.norm(self.model.opt.gravity) > 0)
-        self.grasps: list[str] = []
-        for number in range(self.model.nkey):
-            name = self.model.key(number).name.partition("/")[0]
-            if name not in self.grasps:
-                self.grasps.append(name)
+        keys = [self.model.key(number).name for number in range(self.model.nkey)]
+        self.grasps = list(dict.fromkeys(key.partition("/")[0] for key in keys))
 
     def key(self, grasp: str, posture: str) -> Any:
         return self.model.key(f"{grasp}/{posture}")
@@ -99,7 +96,7 @@ class Replay:
         return False
 
     def move(self, grasp: str, a: str, b: str) -> None:
-        """Command the path from one key frame's targets to another's."""
+        """Command the straight path from the targets of key frame `a` to those of `b`."""
         first, last = self.key(grasp, a), self.key(grasp, b)
         for stage in range(1, STAGES + 1):
             share = stage / STAGES
@@ -109,7 +106,7 @@ class Replay:
             self.run(STAGE_S)
 
     def hold(self, goal: Any) -> str:
-        """Hold as the validator does; end once the object's velocities keep it within half of its limits."""
+        """Wait for `HOLD_S` [s], or until the result is clear: `held`, `lost` or `turned`."""
         self.run(FIRST_LOOK_S - LOOK_S)
         elapsed, before = FIRST_LOOK_S - LOOK_S, self.offset(goal)
         while elapsed < HOLD_S - 1e-9:
@@ -154,16 +151,15 @@ class Replay:
         return bool(self.of_hand[contact.geom].any())
 
     def touches(self, grasp: str) -> bool:
-        """Check whether the open hand penetrates anything deeper than allowed during its approach."""
+        """Check whether the open hand penetrates anything deeper than `allowed` on its approach."""
         for a, b, looks in (("standoff", "arrival", WAY_LOOKS), ("arrival", "pregrasp", CLOSING_LOOKS)):
             first, last = self.key(grasp, a), self.key(grasp, b)
             for look in range(looks):
                 share = look / looks
                 qpos = (1 - share) * first.qpos + share * last.qpos
                 root = self.model.jnt_qposadr[self.model.joint("root").id]
-                qpos[root + 3 : root + 7] = slerp(
-                    first.qpos[root + 3 : root + 7], last.qpos[root + 3 : root + 7], share
-                )
+                turn = slice(root + 3, root + 7)
+                qpos[turn] = slerp(first.qpos[turn], last.qpos[turn], share)
                 self.data.qpos[:] = qpos
                 mujoco.mj_kinematics(self.model, self.data)
                 mujoco.mj_collision(self.model, self.data)
@@ -171,9 +167,7 @@ class Replay:
                     self.watch(self)
                 for contact in self.data.contact:
                     ours = self.of_hand[contact.geom]
-                    if not ours.any() or ours.all():
-                        continue
-                    if contact.dist < -self.allowed(contact.geom):
+                    if ours.any() and not ours.all() and contact.dist < -self.allowed(contact.geom):
                         return True
         return False
 

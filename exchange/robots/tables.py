@@ -1,12 +1,8 @@
 """Grasps as text files: three CSV tables, and Isaac Sim's grasp file (`isaac_grasp`, version 1.0).
 
-Poses in the tables are poses of the tool frame: x y z [m], unit quaternion qw qx qy qz. Joint columns [rad or m] have
-the joints' names.
-
-In Isaac Sim's file, a grasp is the pose of the gripper's frame in the object's frame: position [m], quaternion w and
-xyz. `cspace_position` has the joints of the grasp, `pregrasp_cspace_position` those of the pregrasp. Joints that the
-URDF couples are omitted. Isaac Sim uses frame names `..._frame_link`, Isaac ROS `..._frame`, so both are written.
-Further postures and epsilon are under the key `graspd`, which readers ignore."""
+Poses are those of the tool frame; joint columns [rad or m] have the joints' names. Isaac Sim's file omits joints that
+the URDF couples. Isaac Sim uses frame names `..._frame_link`, Isaac ROS `..._frame`, so the file has both. Further
+postures and epsilon are under the key `graspd`, which readers ignore."""
 
 from __future__ import annotations
 

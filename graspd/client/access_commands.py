@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 import typer
 
-from graspd.api.access.keys import Key, KeyFile, KeyLimits, ProjectLimits, Scope
+from graspd.api.access.keys import KeyFile, KeyLimits, ProjectLimits, Scope
 from graspd.api.formatting import minute
 from graspd.client.client import path_of
 from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, report_deletion
@@ -20,12 +20,8 @@ keys_app = CommandGroup(no_args_is_help=True, help="Make, list, rotate, limit an
 _UNITS: Final = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days"}
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the key.")]
-ProjectOption = Annotated[
-    str, typer.Option(help="Project of the key; keys of other projects cannot see its resources.", metavar="NAME")
-]
-LifetimeOption = Annotated[
-    str | None, typer.Option("--expires", help="Lifetime, such as 90d or 12h; default: unlimited.")
-]
+ProjectOption = Annotated[str, typer.Option(help="Project of the key; its resources are private.", metavar="NAME")]
+LifetimeOption = Annotated[str | None, typer.Option("--expires", help="Lifetime: 90d or 12h; default: unlimited.")]
 RequestsOption = Annotated[int | None, typer.Option(min=0, help="Requests per minute; 0: no limit.")]
 ConcurrencyOption = Annotated[int | None, typer.Option(min=0, help="Concurrent requests; 0: no limit.")]
 GraspsOption = Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")]
@@ -45,27 +41,25 @@ def add_key(
     json: JsonFlag = False,
 ) -> None:
     """Make a key and show it once. Default limits are those of the settings."""
-    given = _given_limits(
+    limits = KeyLimits(
         requests_per_minute=requests_per_minute,
         concurrency=concurrency,
         grasps_in_flight=grasps_in_flight,
         jobs_per_day=jobs_per_day,
     )
     lifetime = duration(expires) if expires else None
-    token = _key_file().add(name, scope, lifetime=lifetime, limits=KeyLimits(**given), project=project)
+    token = _key_file().add(name, scope, lifetime=lifetime, limits=limits, project=project)
     _show_token(name, scope, token, json=json)
 
 
 @keys_app.command("rotate", epilog="graspd keys rotate alice --grace 24h")
 def rotate_key(
     name: NameArgument,
-    grace: Annotated[
-        str, typer.Option(help="Time for which the old secret remains valid, such as 24h or 7d; 0s: none.")
-    ] = "0s",
+    grace: Annotated[str, typer.Option(help="Time for which the old secret remains valid: 24h, 7d.")] = "0s",
     expires: LifetimeOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Replace the secret of a key and show it once. Scope and limits remain."""
+    """Replace the secret of a key and show it once; scope, project and limits do not change."""
     keys = _key_file()
     token = keys.rotate(name, grace=duration(grace), lifetime=duration(expires) if expires else None)
     _show_token(name, next(key.scope for key in reversed(keys.list()) if key.name == name), token, json=json)
@@ -103,9 +97,10 @@ def list_keys(json: JsonFlag = False) -> None:
     names = ["name", "scope", *(["project"] if has_projects else []), "state", "created", "expires", "limits"]
     rows = []
     for key in found:
-        of = [key.project or "-"] if has_projects else []
+        project = [key.project or "-"] if has_projects else []
+        state = "live" if key.is_live else f"revoked {key.revoked[:16]}" if key.revoked else "expired"
         times = minute(key.created), minute(key.expires)
-        rows.append((key.name, key.scope, *of, _state(key), *times, _key_limits(key.limits)))
+        rows.append((key.name, key.scope, *project, state, *times, _key_limits(key.limits)))
     empty = "no key; the service answers only this machine"
     print_rows(document, names, rows, whole=("state", "created", "expires"), empty=empty, json=json)
 
@@ -118,7 +113,7 @@ def revoke_key(name: NameArgument, json: JsonFlag = False) -> None:
 
 
 def duration(text: str) -> timedelta:
-    """Parse a time such as 90d, 12h, 30m or 45s; InputError for anything else."""
+    """Parse a time such as 90d, 12h, 30m or 45s; raise InputError for any other text."""
     match = re.fullmatch(r"(\d{1,6})([smhd])", text.strip())
     if match is None:
         raise InputError(f"{text!r} is not a duration; write 90d, 12h, 30m or 45s")
@@ -133,12 +128,6 @@ def _show_token(name: str, scope: Scope, token: str, *, json: bool) -> None:
     print_result({"name": name, "scope": scope, "key": token}, token, json=json)
     if not json:
         typer.echo("This is the only time the key is shown. Send it as `Authorization: Bearer ...`.", err=True)
-
-
-def _state(key: Key) -> str:
-    if key.is_live:
-        return "live"
-    return f"revoked {key.revoked[:16]}" if key.revoked else "expired"
 
 
 def _key_limits(limits: KeyLimits) -> str:
@@ -162,32 +151,26 @@ def list_projects(json: JsonFlag = False) -> None:
         if key.is_live and key.name not in live.setdefault(key.project, []):
             live[key.project].append(key.name)
     found = file.projects()
-    plain = {name: limits.model_dump(exclude_none=True) for name, limits in found.items()}
-    document = {"projects": [{"project": name, "keys": live.get(name, []), "limits": plain[name]} for name in found]}
-    rows = [
-        (name, ", ".join(live.get(name, [])) or "no valid key", _project_limits(limits))
-        for name, limits in found.items()
-    ]
+    projects, rows = [], []
+    for name, limits in found.items():
+        keys = live.get(name, [])
+        projects.append({"project": name, "keys": keys, "limits": limits.model_dump(exclude_none=True)})
+        rows.append((name, ", ".join(keys) or "no valid key", _project_limits(limits)))
     empty = "no project yet; `graspd keys add NAME --project PROJECT` makes one"
-    print_rows(document, ("project", "keys", "limits"), rows, empty=empty, json=json)
+    print_rows({"projects": projects}, ("project", "keys", "limits"), rows, empty=empty, json=json)
 
 
-@projects_app.command(
-    "limit", epilog="graspd projects limit vision --grasps-per-day 1000000 --gpu-seconds-per-day 86400"
-)
+@projects_app.command("limit", epilog="graspd projects limit vision --gpu-seconds-per-day 86400")
 def limit_project(
     name: Annotated[str, typer.Argument(help="Name of the project.")],
     grasps_in_flight: Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")] = None,
     grasps_per_day: Annotated[int | None, typer.Option(min=0, help="Requested grasps per day; 0: no limit.")] = None,
-    gpu_seconds_per_day: Annotated[
-        int | None, typer.Option(min=0, help="GPU seconds per day (UTC) until new jobs are refused; 0: no limit.")
-    ] = None,
+    gpu_seconds_per_day: Annotated[int | None, typer.Option(min=0, help="GPU time per day [s]; 0: no limit.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Change the shared limits of a project's keys, from the next submission on."""
-    given = _given_limits(
-        grasps_in_flight=grasps_in_flight, grasps_per_day=grasps_per_day, gpu_seconds_per_day=gpu_seconds_per_day
-    )
+    per_day = {"grasps_per_day": grasps_per_day, "gpu_seconds_per_day": gpu_seconds_per_day}
+    given = _given_limits(grasps_in_flight=grasps_in_flight, **per_day)
     if not given:
         raise InputError("give at least one limit, such as --grasps-per-day 1000000")
     limits = _key_file().limit_project(name, ProjectLimits(**given))
@@ -200,9 +183,7 @@ def _project_limits(limits: ProjectLimits) -> str:
     return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in found.items()) or "none"
 
 
-webhooks_app = CommandGroup(
-    no_args_is_help=True, help="Webhooks that receive a notification when jobs and datasets end."
-)
+webhooks_app = CommandGroup(no_args_is_help=True, help="Notify URLs when jobs and datasets end.")
 
 IdArgument = Annotated[str, typer.Argument(metavar="ID", help="Id of the webhook, from `graspd webhooks list`.")]
 
@@ -210,9 +191,7 @@ IdArgument = Annotated[str, typer.Argument(metavar="ID", help="Id of the webhook
 @webhooks_app.command("add", epilog="graspd webhooks add https://ci.example.org/graspd --on succeeded,failed")
 def add_webhook(
     address: Annotated[str, typer.Argument(help="URL that receives the POST requests: https://host/path.")],
-    on: Annotated[
-        str, typer.Option(help="End states to notify of, separated by commas.")
-    ] = "succeeded,failed,cancelled",
+    on: Annotated[str, typer.Option(help="Final states, separated by commas.")] = "succeeded,failed,cancelled",
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
@@ -244,8 +223,7 @@ def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False)
     for one in found:
         what = f"{one['kind']} {one['subject'][:12] if one['kind'] == 'job' else one['subject']}"
         rows.append((what, one["ended"], one["state"], str(one["attempts"]), minute(one["tried"]), one["detail"]))
-    names = ("what", "ended", "delivery", "attempts", "last", "")
-    whole = ("ended", "delivery", "last")
+    names, whole = ("what", "ended", "delivery", "attempts", "last", ""), ("ended", "delivery", "last")
     print_rows({"deliveries": found}, names, rows, whole=whole, empty="no delivery yet", json=json)
 
 

@@ -1,7 +1,4 @@
-"""`graspd hands add`, `objects add`, `networks add`: upload an asset or a set, and wait for its check.
-
-A hand is a folder, or a model file with the files that it needs. All its files are packed into one ZIP.
-"""
+"""`graspd hands add`, `objects add`, `networks add`: upload an asset or a set, and wait for its check."""
 
 from __future__ import annotations
 
@@ -53,9 +50,7 @@ def add_hand(
     options: dict[str, Any],
     licence: LicenceOption = None,
     source: SourceOption = None,
-    self_test: Annotated[
-        bool, typer.Option("--self-test/--no-self-test", help="Run the self-test: hold and lift simple shapes.")
-    ] = True,
+    self_test: Annotated[bool, typer.Option(help="Run the self-test: hold and lift simple shapes.")] = True,
     shared: SharedOption = False,
     wait: WaitOption = True,
     url: UrlOption = None,
@@ -131,14 +126,14 @@ def _add(
 
 @contextmanager
 def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the file to send (`path` or a temporary ZIP), and the hand's main file in the ZIP, if known."""
+    """Yield `path` or a temporary ZIP of all files of the hand, and the main file in this ZIP."""
     alone = not path.is_dir() and (path.suffix.lower() not in SUFFIXES or not path.is_file())
     files, main = ({}, "") if alone else files_of_hand(path)
     if len(files) <= 1 and not path.is_dir():
         yield path, ""
         return
     with TemporaryDirectory(prefix="graspd-hand-") as folder:
-        # The file is named after the hand, unless the user gives another name.
+        # Without --name, the hand gets the name of this file.
         archive = Path(folder) / f"{hand_name(path.resolve().name)}.zip"
         archive.write_bytes(pack({name: file.read_bytes() for name, file in files.items()}))
         yield archive, main
@@ -204,9 +199,9 @@ def upload_set(
     wait: bool = True,
     say: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Upload objects, wait for their checks, and make a set; a refused object does not stop the others.
+    """Upload objects, wait for their checks, and make a set of those that are not refused.
 
-    Return name, verdict, message and repairs of each; `say` gets a line for each as soon as its check is done.
+    Return name, verdict, message and repairs of each object; `say` is called with a line after each check.
     """
     told = [
         _upload(client, f"{prefix}-{name}" if prefix else name, files, options or {}, shared=shared)

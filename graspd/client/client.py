@@ -43,15 +43,14 @@ class Client(AbstractContextManager["Client"]):
     def __init__(self, url: str, *, key: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
         address = _address(url.strip().rstrip("/"))
         self.url = without_secrets(str(address)).rstrip("/")
-        # A proxy from the environment cannot reach loopback addresses of this machine.
-        is_local = is_loopback(address.host)
         self._http = httpx.Client(
             base_url=address,
             headers=_authorization((key or "").strip()),
             timeout=_TIMEOUT,
             transport=transport,
             follow_redirects=True,
-            trust_env=not is_local,
+            # A proxy from the environment cannot reach loopback addresses of this machine.
+            trust_env=not is_loopback(address.host),
         )
 
     def __exit__(self, *_: object) -> None:
@@ -98,10 +97,7 @@ class Client(AbstractContextManager["Client"]):
         self_test: bool = False,
         shared: bool = False,
     ) -> AssetView:
-        """Upload a file or a ZIP; `options` override its `asset.json`. InputError if it is unreadable.
-
-        With `self_test` the check of a hand includes the self-test; a `shared` asset is usable by every project.
-        """
+        """Upload a file or a ZIP; `options` override keys of its `asset.json`."""
         fields = ({"name": name} if name else {}) | ({"options": json.dumps(options)} if options else {})
         fields |= {name: "true" for name, wanted in {"self_test": self_test, "shared": shared}.items() if wanted}
         try:
@@ -112,7 +108,7 @@ class Client(AbstractContextManager["Client"]):
             raise InputError(f"{path} cannot be read: {error.strerror}") from None
 
     def wait_checked(self, kind: AssetKind, digest: str, *, timeout_s: float = 120.0) -> AssetView:
-        """Return an uploaded asset after its check; after a refusal, its name may refer to another asset."""
+        """Return an uploaded asset after its check; raise UnavailableError after `timeout_s`."""
         deadline = time.monotonic() + timeout_s
         while (asset := self.asset(kind, digest)).verdict is None:
             if time.monotonic() > deadline:
@@ -124,7 +120,7 @@ class Client(AbstractContextManager["Client"]):
     def fetch(
         self, path: str, *, params: dict[str, str] | None = None, patience_s: float = _PATIENCE_S
     ) -> Iterator[bytes]:
-        """Yield chunks of a file from the API; each may take at most `patience_s` [s]."""
+        """Yield chunks of a file from the API; each takes at most `patience_s` [s]."""
         timeout = httpx.Timeout(patience_s, connect=_CONNECT_S)
         with _convert_errors(self.url), self._http.stream("GET", path, params=params, timeout=timeout) as answer:
             _raise_for(answer)
@@ -145,7 +141,7 @@ class Client(AbstractContextManager["Client"]):
         return path
 
     def watch(self, job_id: str) -> Iterator[Job]:
-        """Yield a job at each change until it ends; reconnect after a restart of the API."""
+        """Yield a job at each change until it ends; reconnect if the connection breaks."""
         while True:
             try:
                 for event, data in self._events(path_of("jobs", job_id, "events")):
@@ -220,14 +216,13 @@ class Client(AbstractContextManager["Client"]):
         return kind.model_validate_json(self.send(method, path, **options).content)
 
     def _is_reachable_again(self) -> bool:
-        deadline = time.monotonic() + 30.0
+        deadline = time.monotonic() + _PATIENCE_S
         while time.monotonic() < deadline:
             try:
                 self.send("GET", "/healthz")
+                return True
             except UnavailableError:
                 time.sleep(_POLL_S)
-            else:
-                return True
         return False
 
     def _events(self, path: str) -> Iterator[tuple[str, Any]]:
@@ -236,7 +231,7 @@ class Client(AbstractContextManager["Client"]):
             yield from events_of(answer)
 
     def send(self, method: str, path: str, *, params: dict[str, Any] | None = None, **options: Any) -> httpx.Response:
-        """Send a request and return the response; raise the error of a problem document."""
+        """Send a request and return the response; raise a problem document as an exception."""
         given = {name: value for name, value in (params or {}).items() if value is not None}
         for wait in (*_WAITS_S, None):
             with _convert_errors(self.url):
@@ -255,7 +250,7 @@ def path_of(*parts: str) -> str:
 
 
 def _matrix_body(matrix: Matrix) -> dict[str, Any]:
-    """Build the body of a matrix without empty fields, which an older service may reject."""
+    """Build the body of a matrix without empty fields, because an older service may reject these."""
     return {name: value for name, value in matrix.model_dump(mode="json").items() if value not in ({}, "")}
 
 

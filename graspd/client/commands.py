@@ -51,16 +51,18 @@ def submit(
 ) -> None:
     """Submit a job: one hand on one object."""
     with open_client(url) as client:
-        as_object = partial(_asset_name, client, AssetKind.OBJECT)
-        pair = {"hand": _asset_name(client, AssetKind.HAND, hand), "object": as_object(object)}
+        object_name = partial(_asset_name, client, AssetKind.OBJECT)
         own = parse_pairs(options.get("options", ()))
         if options.get("method") in NETWORK_METHODS and "network" in own:
             own["network"] = _asset_name(client, AssetKind.NETWORK, str(own["network"]))
-        place = {
-            "scene": scene_option(options.get("scene", "free"), named=as_object),
-            "neighbours": [as_object(one) for one in options.get("neighbours", ())],
+        options |= {
+            "hand": _asset_name(client, AssetKind.HAND, hand),
+            "object": object_name(object),
+            "options": own,
+            "scene": scene_option(options.get("scene", "free"), named=object_name),
+            "neighbours": [object_name(one) for one in options.get("neighbours", ())],
         }
-        request = parsed_options(JobRequest, pair | options | place | {"options": own})
+        request = parsed_options(JobRequest, options)
         job = client.submit(request)
         if wait:
             job = watch(client, job.id)
@@ -105,7 +107,7 @@ def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -
 
 @app.command(epilog="graspd delete 3f2a")
 def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
-    """Delete an ended job. After a grace time its shards are deleted, unless another job uses them."""
+    """Delete an ended job. Shards that no other job uses are deleted after a grace time."""
     with open_client(url) as client:
         job = client.job(_full_id(client, job_id))
         asked = f"Delete job {job.id[:12]}, {job.hand} on {job.object}, with its {count(job.grasps)} grasps?"
@@ -174,15 +176,14 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
             assets = list(client.assets(kind, refused=refused))
         document = {f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]}
         # All networks have the same file name, so their hand is shown instead.
-        second = "hand" if kind is AssetKind.NETWORK else "file"
-        rows = []
+        is_network, rows = kind is AssetKind.NETWORK, []
         for asset in assets:
             origin = "built-in" if asset.builtin else (asset.verdict or "waiting")
             if says := self_test_line(asset.facts):
                 origin += f"; {says}"
-            named = hand_line(asset.facts) if kind is AssetKind.NETWORK else asset.filename
-            rows.append((asset.name, named, size(asset.size_bytes), origin, asset.digest[:12]))
-        names = ("name", second, "size", "check", "digest")
+            second = hand_line(asset.facts) if is_network else asset.filename
+            rows.append((asset.name, second, size(asset.size_bytes), origin, asset.digest[:12]))
+        names = ("name", "hand" if is_network else "file", "size", "check", "digest")
         print_rows(document, names, rows, whole=("size", "digest"), json=json)
 
     @group.command("show", help=f"Show a {kind.value} with the findings of its check.")
@@ -237,10 +238,8 @@ def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
     with open_client(url) as client:
         found = client.object_sets()
     document = {"sets": [one.model_dump(mode="json") for one in found]}
-    rows = [
-        (one.name, count(len(one.objects)), ", ".join(one.objects[:5]) + ", ..." * (len(one.objects) > 5))
-        for one in found
-    ]
+    shown = [", ".join(one.objects[:5]) + ", ..." * (len(one.objects) > 5) for one in found]
+    rows = [(one.name, count(len(one.objects)), text) for one, text in zip(found, shown, strict=True)]
     empty = "no set yet; `graspd objects add FOLDER` makes one"
     print_rows(document, ("set", "objects", ""), rows, empty=empty, json=json)
 
@@ -257,8 +256,7 @@ app.add_typer(tag_commands.app, name="tags")
 def _asset_name(client: Client, kind: AssetKind, value: str) -> str:
     """Return the name of a hand, object or network; an existing path is uploaded and checked first."""
     path = Path(value)
-    is_file_name = "/" in value or path.suffix.lower() in (*MAIN_SUFFIXES[kind], ".zip")
-    if not is_file_name:
+    if "/" not in value and path.suffix.lower() not in (*MAIN_SUFFIXES[kind], ".zip"):
         return value
     if not path.is_file():
         raise InputError(f"there is no file {value}; give a path that exists, or the name of a known {kind.value}")

@@ -44,20 +44,18 @@ from graspd.service.pipeline.datasets.export import export_shards
 from graspd.service.pipeline.datasets.spec import DatasetRequest, Estimate, Matrix
 from graspd.service.store.object_sets import Objects, files_of_set
 
-SpecOption = Annotated[
-    Path | None, typer.Option("--spec", help="TOML or JSON file of the dataset; options take precedence.")
-]
+SpecOption = Annotated[Path | None, typer.Option("--spec", help="TOML or JSON file; options take precedence.")]
 
 
 class Spec(JobOptions):
+    """Content of a `--spec` file."""
+
     SUBMITTED = True
 
     name: Name | None = None
     hands: tuple[Name, ...] = ()
     objects: str | tuple[str, ...] = Field((), description="as `--objects`; folders are relative to the spec")
-    total_grasps: int | None = Field(
-        None, ge=1, description="grasps over all hands and objects, shared evenly; replaces `grasps`"
-    )
+    total_grasps: int | None = Field(None, ge=1, description="grasps over all cells, divided evenly")
 
     @model_validator(mode="after")
     def _check_grasps(self) -> Spec:
@@ -84,7 +82,7 @@ class PlanRequest:
 def plan_request(
     spec: Path | None, *, name: str | None, hands: str | None, objects: str | None, options: dict[str, Any]
 ) -> PlanRequest:
-    """Combine spec and options; options take precedence. The name is empty if neither contains it."""
+    """Combine spec and options; options take precedence. The name is empty if neither has one."""
     given = dict(options)
     if "options" in given:
         given["options"] = parse_pairs(given["options"])
@@ -106,7 +104,7 @@ def plan_request(
 
 
 def read_spec(file: Path) -> dict[str, Any]:
-    """Return the keys of a spec; InputError if the file is invalid."""
+    """Return the keys of a spec; raise InputError if the file is invalid."""
     kind, load = ("JSON", json.loads) if file.suffix == ".json" else ("TOML", tomllib.loads)
     try:
         found = load(file.read_text())
@@ -130,8 +128,8 @@ def read_spec(file: Path) -> dict[str, Any]:
 def _objects(spec: Path | None, said: Any) -> str:
     if not isinstance(said, str):
         return ",".join(said)
-    beside = spec.parent / said if spec is not None else Path(said)
-    return str(beside) if "/" in said and beside.exists() else said
+    path = spec.parent / said if spec is not None else Path(said)
+    return str(path) if "/" in said and path.exists() else said
 
 
 app = CommandGroup(no_args_is_help=True)
@@ -140,12 +138,7 @@ app.add_typer(group, name="datasets")
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the dataset.")]
 HandsOption = Annotated[str | None, typer.Option("--hands", help="Names of hands: allegro,shadow.")]
-ObjectsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--objects", help="Names of objects or sets: mug,ycb; or a folder or ZIP, which is uploaded as a set."
-    ),
-]
+ObjectsOption = Annotated[str | None, typer.Option("--objects", help="Objects or sets: mug,ycb; or folder to upload.")]
 WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until the dataset ends.")]
 
 
@@ -177,7 +170,9 @@ def create(
         if dry_run:
             _emit(json, estimate=found)
             return
-        if not yes and not _confirm():
+        if not yes and not sys.stdin.isatty():
+            raise InputError("give --yes to start it, or --dry-run for the cost alone")
+        if not yes and not typer.confirm("Start it?"):
             raise InputError("nothing was started")
         refused: list[str] = []
         if files is not None:
@@ -266,9 +261,7 @@ def cancel(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) ->
 def delete(
     name: NameArgument,
     yes: YesOption = False,
-    with_snapshots: Annotated[
-        bool, typer.Option("--with-snapshots", help="Delete its snapshots too; otherwise they prevent the deletion.")
-    ] = False,
+    with_snapshots: Annotated[bool, typer.Option("--with-snapshots", help="Also delete its snapshots.")] = False,
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
@@ -305,10 +298,8 @@ def snapshot(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) 
     with open_client(url) as client:
         taken = client.take_snapshot(name)
     whole = "complete" if taken.complete else "the dataset is not complete"
-    line = (
-        f"{taken.digest}  {count(taken.shards)} shards, {count(taken.grasps)} grasps of which {count(taken.valid)} "
-        f"are valid, {size(taken.size_bytes)}; {whole}"
-    )
+    grasps = f"{count(taken.grasps)} grasps of which {count(taken.valid)} are valid"
+    line = f"{taken.digest}  {count(taken.shards)} shards, {grasps}, {size(taken.size_bytes)}; {whole}"
     print_result(taken, line, json=json)
 
 
@@ -328,11 +319,12 @@ def export(
         console = plain_console(stderr=True)
         with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
             bar = progress.add_task(name, total=taken.size_bytes, files="")
-
-            def show(done: int, files: int, fetched: int) -> None:
-                progress.update(bar, completed=fetched, files=f"{done}/{files}")
-
-            fetched = export_shards(taken, out, lambda shard: client.fetch(path_of("shards", shard.id, "file")), show)
+            fetched = export_shards(
+                taken,
+                out,
+                lambda shard: client.fetch(path_of("shards", shard.id, "file")),
+                lambda done, files, fetched: progress.update(bar, completed=fetched, files=f"{done}/{files}"),
+            )
     told = {"dataset": name, "snapshot": taken.digest, "out": str(out), "files": len(taken.shards), "fetched": fetched}
     line = f"{out}: {count(len(taken.shards))} files, {size(taken.size_bytes)}, snapshot {taken.digest}"
     print_result({**told, "bytes": taken.size_bytes, "complete": taken.complete}, line, json=json)
@@ -359,16 +351,13 @@ def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[st
 
 
 def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> Estimate:
-    """Return the cost; InputError for an unknown name that is not among the files to upload."""
+    """Return the cost; raise InputError for unknown names, except names of files to upload."""
     asked = matrix | {"sets": []} if files is not None else matrix
     found = client.estimate(parsed_options(Matrix, asked))
-    unknown = [name for name in found.unknown if name not in (files or {})]
-    if unknown:
+    if unknown := [name for name in found.unknown if name not in (files or {})]:
         known = [one.name for kind in (AssetKind.HAND, AssetKind.OBJECT) for one in client.assets(kind)]
-        raise InputError(
-            f"there is no hand or object {', '.join(map(repr, unknown[:5]))}; `graspd hands list` and `graspd objects "
-            f"list` show the known ones{did_you_mean(unknown[0], known)}"
-        )
+        fix = f"`graspd hands list` and `graspd objects list` show the known ones{did_you_mean(unknown[0], known)}"
+        raise InputError(f"there is no hand or object {', '.join(map(repr, unknown[:5]))}; {fix}")
     return found
 
 
@@ -379,12 +368,6 @@ def _upload(client: Client, files: Objects, set_name: str, console: Console) -> 
     if len(refused) == len(told):
         raise InputError(f"none of the {len(told)} objects can be used; reasons are above")
     return refused
-
-
-def _confirm() -> bool:
-    if not sys.stdin.isatty():
-        raise InputError("give --yes to start it, or --dry-run for the cost alone")
-    return typer.confirm("Start it?")
 
 
 def _emit(json: bool, **parts: Estimate | DatasetView | list[str]) -> None:
@@ -401,6 +384,5 @@ def _show(dataset: DatasetView, *, json: bool) -> None:
 
 def _check_success(dataset: DatasetView, *, asked: bool) -> None:
     if asked and dataset.state in (State.FAILED, State.CANCELLED):
-        raise TaskError(
-            f"dataset {dataset.name} is {dataset.state.value}; `graspd datasets retry {dataset.name}` runs it again"
-        )
+        fix = f"`graspd datasets retry {dataset.name}` runs it again"
+        raise TaskError(f"dataset {dataset.name} is {dataset.state.value}; {fix}")

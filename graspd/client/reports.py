@@ -1,7 +1,4 @@
-"""Terminal output of the commands: progress, jobs, assets, estimates and datasets.
-
-On a terminal, a job's progress is one bar per stage with rate and time left; elsewhere it is plain lines.
-"""
+"""Terminal output of the commands: progress, jobs, assets, estimates and datasets."""
 
 from __future__ import annotations
 
@@ -27,16 +24,11 @@ from graspd.service.pipeline.datasets.spec import Estimate
 from graspd.service.run.address import recorded_address
 from graspd.service.store.asset_summary import summary
 
-UrlOption = Annotated[
-    str | None,
-    typer.Option(
-        "--url", help="URL of the API; default: GRASPD_API_URL, else the local service that runs on the data folder."
-    ),
-]
+UrlOption = Annotated[str | None, typer.Option("--url", help="URL of the API; default: GRASPD_API_URL or a local one.")]
 
 
 def open_client(url: str | None, *, key: str | None = None) -> Client:
-    """Return a client of the API at `url` (default: settings, data folder) with `key` (default: settings)."""
+    """Return a client; the default of `url` is the setting or the recorded address, of `key` the setting."""
     settings = load_settings()
     if key is None and settings.api_key:
         key = settings.api_key.get_secret_value()
@@ -49,7 +41,7 @@ YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Delete without con
 
 
 def confirm(question: str, what: str, *, yes: bool) -> None:
-    """Ask before a deletion; InputError if the answer is no, or without a terminal."""
+    """Ask before a deletion; raise InputError if the answer is no, or without a terminal."""
     if yes:
         return
     if not sys.stdin.isatty():
@@ -79,7 +71,7 @@ def print_rows(
     empty: str = "",
     json: bool,
 ) -> None:
-    """Print a list as JSON or a table; `empty` replaces an empty table; columns `whole` are not wrapped."""
+    """Print a list as JSON or as a table; `empty`: text for no rows; `whole`: columns without wrapping."""
     if json:
         print_json(document)
         return
@@ -157,11 +149,8 @@ def yield_of(job: JobDetail) -> str:
 
 
 def mean_metrics(job: JobDetail) -> str:
-    mean = job.mean
-    return (
-        f"mean ε {metric(mean.epsilon)}, contact {metric(mean.contact_area_cm2)} cm², "
-        f"intersection {metric(mean.intersection_volume_cm3)} cm³"
-    )
+    epsilon, area, volume = map(metric, (job.mean.epsilon, job.mean.contact_area_cm2, job.mean.intersection_volume_cm3))
+    return f"mean ε {epsilon}, contact {area} cm², intersection {volume} cm³"
 
 
 def _print_job(job: JobDetail, url: str) -> None:
@@ -175,10 +164,8 @@ def _print_job(job: JobDetail, url: str) -> None:
         console.print(f"note: {job.note}")
     table = plain_table("stage", "state", "tasks", "progress", "worker time", "left")
     for stage in job.stages:
-        done = f"{stage.succeeded} of {stage.tasks}"
-        table.add_row(
-            stage.stage, stage.state, done, percent(stage.progress), worker_time(stage), duration(stage.eta_s)
-        )
+        done, times = f"{stage.succeeded} of {stage.tasks}", (worker_time(stage), duration(stage.eta_s))
+        table.add_row(stage.stage, stage.state, done, percent(stage.progress), *times)
     console.print(table)
     if job.grasps:
         console.print(f"{yield_of(job)}; {mean_metrics(job)}")
@@ -201,7 +188,7 @@ class _Rate(ProgressColumn):
 
 
 class JobDisplay:
-    """Display of one job's progress. Usable as a context manager."""
+    """Context manager that shows a job's progress: bars on a terminal, elsewhere lines."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -277,16 +264,10 @@ def _size_of(stage: StageStatus, job: Job) -> tuple[int, str]:
     return (job.requested, "grasps") if stage.stage is Stage.SYNTHESIZE else (stage.tasks, "tasks")
 
 
-#: Most hands in a table that fits a terminal; with more hands each cell has a line.
+#: Maximum number of hands in a table; with more hands, each cell has a line.
 _MOST_COLUMNS: Final = 6
 _SHOWN_RATES: Final = 8
-_STYLES: Final = {
-    State.SUCCEEDED: "green",
-    State.RUNNING: "cyan",
-    State.QUEUED: "dim",
-    State.FAILED: "red",
-    State.CANCELLED: "yellow",
-}
+_STYLES: Final = {"succeeded": "green", "running": "cyan", "queued": "dim", "failed": "red", "cancelled": "yellow"}
 
 
 def print_estimate(found: Estimate, console: Console) -> None:
@@ -344,10 +325,9 @@ def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Consol
         table = plain_table("", *dataset.hands)
         at = {(cell.hand, cell.object): cell for cell in cells}
         for obj in dataset.objects:
-            found = [at.get((hand, obj)) for hand in dataset.hands]
-            table.add_row(
-                obj, *(Text(_cell_text(cell, dataset.options), _STYLES[cell.state]) if cell else "" for cell in found)
-            )
+            row = [at.get((hand, obj)) for hand in dataset.hands]
+            texts = [Text(_cell_text(cell, dataset.options), _STYLES[cell.state]) if cell else "" for cell in row]
+            table.add_row(obj, *texts)
     console.print(table)
     for cell in [cell for cell in cells if cell.reason][:5]:
         console.print(f"{cell.hand} on {cell.object}: {cell.reason}", soft_wrap=True)

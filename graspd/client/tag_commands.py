@@ -21,9 +21,7 @@ _PATIENCE_S: Final = 600.0
 
 NameArgument = Annotated[str, typer.Argument(metavar="TAG", help="Name of the tag: `graspd tags list`.")]
 GraspsArgument = Annotated[list[str] | None, typer.Argument(metavar="[SHARD:ROW]...", help="Grasps by shard and row.")]
-WhereOption = Annotated[
-    str | None, typer.Option(help="Grasps that satisfy an expression: epsilon > 0.3 and lift and robust >= 0.75.")
-]
+WhereOption = Annotated[str | None, typer.Option(help="Only grasps that satisfy an expression: epsilon > 0.3.")]
 JobOption = Annotated[str | None, typer.Option(help="Only grasps of this job.")]
 DatasetOption = Annotated[str | None, typer.Option(help="Only grasps of this dataset.")]
 

@@ -32,13 +32,9 @@ def grasps() -> None:
 
 @group.command(epilog='graspd grasps where "epsilon > 0.3 and lift and robust >= 0.75" --from kitchen -o subset')
 def where(
-    expression: Annotated[
-        str, typer.Argument(help="Expression of metrics and verdicts (valid, feasible, held, lift) with and, or, not.")
-    ],
+    expression: Annotated[str, typer.Argument(help="Metrics and verdicts (valid, held, lift); and, or, not.")],
     out: OutOption,
-    source: Annotated[
-        str, typer.Option("--from", help="File, folder of shards, or name of a dataset in the store.")
-    ] = ".",
+    source: Annotated[str, typer.Option("--from", help="File, folder of shards, or name of a dataset.")] = ".",
     json: JsonFlag = False,
 ) -> None:
     """Write the grasps that satisfy an expression as new base shards."""
@@ -55,14 +51,9 @@ def balance(
     source: SourceArgument,
     out: OutOption,
     by: Annotated[str, typer.Option(help=f"Kinds, separated by commas: {', '.join(KINDS)}.")] = "type,direction",
-    at_most: Annotated[
-        int, typer.Option(min=0, help="Maximum number of grasps per kind, hand and object; 0: the median over kinds.")
-    ] = 0,
+    at_most: Annotated[int, typer.Option(min=0, help="Maximum per kind and cell; 0: the median over kinds.")] = 0,
     min_distance: Annotated[
-        float,
-        typer.Option(
-            min=0, max=0.1, help="Minimum distance between grasps of a hand on an object, over all batches [m]; 0: any."
-        ),
+        float, typer.Option(min=0, max=0.1, help="Minimum distance between grasps of a cell [m]; 0: any.")
     ] = 0.0,
     hand: Annotated[str | None, typer.Option(help="Hand file for distances; default: found by its digest.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random selection within a kind.")] = 0,
@@ -88,25 +79,18 @@ def clouds(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; it must be new or empty.")],
     points: Annotated[int, typer.Option(min=1, max=10_000_000, help="Points per cloud.")] = 1024,
     noise: Annotated[str, typer.Option(help=f"Noise model of a depth camera: {', '.join(NOISES)}; or none.")] = "none",
-    frame: Annotated[
-        Frame | None,
-        typer.Option(help="Frame of the points: camera, table or object; default: camera, with --fuse table."),
-    ] = None,
+    frame: Annotated[Frame | None, typer.Option(help="Frame of points; default: camera, with --fuse table.")] = None,
     fuse: Annotated[bool, typer.Option("--fuse", help="Fuse all views of a scene into one cloud.")] = False,
     scene: Annotated[bool, typer.Option("--scene", help="Include table and neighbours.")] = False,
-    voxel: Annotated[
-        float, typer.Option(min=0.0, help="Voxel size with one point per voxel [m]; 0: all points.")
-    ] = 0.0,
-    graspness: Annotated[
-        bool, typer.Option("--graspness", help="Add graspness: share of grasps whose hand touches the point.")
-    ] = False,
+    voxel: Annotated[float, typer.Option(min=0, help="Size of voxels with one point each [m]; 0: all points.")] = 0.0,
+    graspness: Annotated[bool, typer.Option("--graspness", help="Add the share of grasps that touch a point.")] = False,
     unvalidated: UnvalidatedOption = False,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same clouds.")] = 0,
     json: JsonFlag = False,
 ) -> None:
     """Write the pictures of a dataset as point clouds with their grasps: docs/how-to/clouds.md.
 
-    Python code needs no such files: `Pictures(shards).clouds()` computes the same clouds on demand.
+    In Python, `Pictures(shards).clouds()` computes the same clouds without files.
     """
     pictures = Pictures(shards_of(source), unvalidated=unvalidated)
     if not len(pictures):

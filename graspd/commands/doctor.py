@@ -45,12 +45,11 @@ def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
 
 
 def check_gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[], bool] | None = None) -> Finding:
-    """Check which GPUs Warp finds, and their free memory; `has_driver` tells if a driver is installed."""
+    """Check which GPUs Warp finds, and their free memory."""
     found, wrong = _run_check(child, ["gpus"])
     if wrong:
-        return bad(
-            f"the GPUs cannot be queried: {wrong}", "see nvidia-smi and dmesg; restart the driver or the machine"
-        )
+        fix = "see nvidia-smi and dmesg; restart the driver or the machine"
+        return bad(f"the GPUs cannot be queried: {wrong}", fix)
     gpus: list[dict[str, Any]] = found["gpus"]
     needed = f"the driver has CUDA {_version(found['driver'])}, Warp is built for {_version(found['toolkit'])}"
     fix = "install driver R580 or newer; containers need NVIDIA's toolkit and --gpus all; check CUDA_VISIBLE_DEVICES"
@@ -60,18 +59,15 @@ def check_gpu(settings: Settings, *, child: Child = run_child, has_driver: Calla
         if (has_driver or _has_driver)():
             return bad(f"this machine has an NVIDIA driver, but no GPU can be used; {needed}", fix)
         return good("none; work runs on the CPU")
-    if settings.device.startswith("cuda") and settings.device not in [one["name"] for one in gpus]:
-        return bad(
-            f"GRASPD_DEVICE is {settings.device}, but there are {', '.join(one['name'] for one in gpus)}",
-            "set it to one of these, or auto",
-        )
-    line = ", ".join(
-        f"{one['name']} {one['model']} {one['free'] / _GIB:.0f} of {one['total'] / _GIB:.0f} GiB free" for one in gpus
-    )
+    names = [one["name"] for one in gpus]
+    if settings.device.startswith("cuda") and settings.device not in names:
+        fix = "set it to one of these, or auto"
+        return bad(f"GRASPD_DEVICE is {settings.device}, but there are {', '.join(names)}", fix)
+    free = [f"{one['free'] / _GIB:.0f} of {one['total'] / _GIB:.0f} GiB free" for one in gpus]
+    line = ", ".join(f"{one['name']} {one['model']} {memory}" for one, memory in zip(gpus, free, strict=True))
     if full := [one["name"] for one in gpus if one["free"] < _MEMORY_LOW]:
-        return warning(
-            line, f"see nvidia-smi: other processes fill {', '.join(full)}; launches are halved until they fit"
-        )
+        fix = f"see nvidia-smi: other processes fill {', '.join(full)}; launches are halved until they fit"
+        return warning(line, fix)
     return good(f"{line}; {needed}")
 
 
@@ -79,10 +75,8 @@ def check_kernels(settings: Settings, *, child: Child = run_child) -> Finding:
     """Check that the engine gives plausible results, as a worker does before its first task."""
     found, wrong = _run_check(child, ["kernels", settings.device])
     if wrong:
-        return bad(
-            f"the engine does not run: {wrong}",
-            "pip install 'graspd[worker]'; see disk and memory; dmesg lists killed processes",
-        )
+        fix = "pip install 'graspd[worker]'; see disk and memory; dmesg lists killed processes"
+        return bad(f"the engine does not run: {wrong}", fix)
     if found["error"]:
         fix = f"see the message; for a damaged cache remove {found['cache']}"
         return bad(f"on {found['device']}: {found['error']}", fix)
@@ -142,7 +136,7 @@ def main(arguments: Sequence[str]) -> None:
     told = _report_gpus() if arguments[0] == "gpus" else _report_kernels(arguments[1])
     sys.stdout.write(f"{json.dumps(told)}\n")
     sys.stdout.flush()
-    # A regular exit of Warp takes seconds, and there is nothing to save.
+    # A regular exit of Warp takes seconds.
     os._exit(0)
 
 

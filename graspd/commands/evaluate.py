@@ -36,64 +36,33 @@ _COLUMNS: Final = (
 
 @app.command(name="evaluate", epilog="graspd evaluate grasps.h5 --level dexgraspbench")
 def evaluate_command(
-    files: Annotated[
-        list[Path],
-        typer.Argument(help="Base shards, reference-grasp JSON files, folders of either, DexGraspBench folders."),
-    ],
+    files: Annotated[list[Path], typer.Argument(help="Base shards, reference JSON files, DexGraspBench folders.")],
     protocol: Annotated[
-        str,
-        typer.Option(
-            help="dexgraspbench: six pushes; lift: lift test in the scene of each grasp; displacement: only the "
-            "object's displacement in 0.15 s."
-        ),
+        str, typer.Option(help="dexgraspbench: six pushes; lift: lift in the scene; displacement: motion in 0.15 s.")
     ] = "dexgraspbench",
-    level: Annotated[
-        str,
-        typer.Option(help="Level of validation: dexgraspbench, standard or fast; for lifts: dexgraspbench or lift."),
-    ] = "",
-    hard: Annotated[
-        bool, typer.Option("--hard", help="Use half the friction and a tenth of the torsional friction.")
-    ] = False,
-    hand: Annotated[
-        str | None, typer.Option(help="Hand file; default: the hand of the grasp file, found by its digest.")
-    ] = None,
-    object: Annotated[
-        str | None, typer.Option(help="Object file; default: the object of the grasp file, found by its digest.")
-    ] = None,
+    level: Annotated[str, typer.Option(help="Level: dexgraspbench, standard, fast; lifts: dexgraspbench, lift.")] = "",
+    hard: Annotated[bool, typer.Option("--hard", help="Half friction, and a tenth of the torsional friction.")] = False,
+    hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
+    object: Annotated[str | None, typer.Option(help="Object file; default: found by its digest.")] = None,
     robust: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            max=MOST_ROBUST_MODELS,
-            help="Number of perturbed models in which held grasps are validated again, such as 8.",
-        ),
+        int, typer.Option(min=0, max=MOST_ROBUST_MODELS, help="Perturbed models for held grasps, such as 8.")
     ] = 0,
     friction: Annotated[
-        float | None,
-        typer.Option(min=0.01, max=3.0, help="Coulomb friction coefficient for ε; default: that of the file."),
+        float | None, typer.Option(min=0.01, max=3.0, help="Friction coefficient for ε; default: that of the file.")
     ] = None,
-    validation_hand: Annotated[
-        str | None, typer.Option(help="Second model of the same hand, URDF or MJCF, for an additional validation.")
-    ] = None,
-    joint_map: Annotated[
-        str | None, typer.Option(help="OURS=THEIRS,...: corresponding joints with different names.")
-    ] = None,
+    validation_hand: Annotated[str | None, typer.Option(help="Second model of the hand, to validate with.")] = None,
+    joint_map: Annotated[str | None, typer.Option(help="OURS=THEIRS,...: joints with different names.")] = None,
     validation_tolerance: Annotated[
-        float, typer.Option(min=0.0, help="Maximum distance between corresponding fingertips of the two models [mm].")
+        float, typer.Option(min=0.0, help="Maximum distance between fingertips of the two models [mm].")
     ] = 1e3 * TOLERANCE_M,
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", help="With --robust: copy of the shard, or folder of copies, with robust shares."),
-    ] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="With --robust: copy with robust shares.")] = None,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
     json: JsonFlag = False,
 ) -> None:
     """Measure grasps (medians; ε and areas at 5 mm) and validate them in an independent engine."""
     level = _validate_level(protocol, level)
     if robust and protocol == "displacement":
-        raise InputError(
-            "--robust repeats pushes or lifts in perturbed models: choose --protocol dexgraspbench or lift"
-        )
+        raise InputError("--robust repeats pushes or lifts in perturbed models: use --protocol dexgraspbench or lift")
     if validation_hand is None and joint_map:
         raise InputError("--joint-map needs --validation-hand")
     if validation_hand is not None and protocol != "dexgraspbench":
@@ -110,12 +79,10 @@ def evaluate_command(
         for file in listed:
             case = load_case(file, hand=hand, obj=object)
             if copies and (case.placed is None) == (protocol == "lift"):
-                raise InputError(
-                    f"{file}: -o needs --protocol lift for grasps in scenes, or dexgraspbench for free grasps"
-                )
-            twin = None
-            if other is not None:
-                twin = match_hands(case.hand, other, twins, tolerance_m=validation_tolerance / 1e3)
+                needed = "--protocol lift for grasps in scenes, or dexgraspbench for free grasps"
+                raise InputError(f"{file}: -o needs {needed}")
+            tolerance_m = validation_tolerance / 1e3
+            twin = None if other is None else match_hands(case.hand, other, twins, tolerance_m=tolerance_m)
             row = evaluate(
                 case,
                 protocol=protocol,  # type: ignore[arg-type]
@@ -132,7 +99,7 @@ def evaluate_command(
 
 
 def _validate_level(protocol: str, level: str) -> str:
-    """Return the level, or the protocol's default if empty; InputError for an invalid one."""
+    """Return the level, or the protocol's default if empty; raise InputError if protocol or level is unknown."""
     if protocol not in get_args(Protocol):
         raise InputError(f"unknown protocol {protocol!r}; choose {choices_text(protocol, get_args(Protocol))}")
     levels = get_args(LiftLevel if protocol == "lift" else Level)
@@ -146,9 +113,8 @@ def _report(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
     whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])
     if json:
         verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
-        print_json(
-            {key: value for key, value in whole.items() if key != "verdicts"} | {"verdicts": verdicts, "files": rows}
-        )
+        whole.pop("verdicts", None)
+        print_json(whole | {"verdicts": verdicts, "files": rows})
     else:
         plain_console().print(_table(rows, whole))
         if whole.get("robust_share") is not None:
@@ -179,10 +145,8 @@ def _format_robustness(whole: dict[str, Any]) -> str:
     words = {axis.word: name for axis, name in AXIS_MEANINGS.items()}
     axes = sorted(whole["robust_axes"].items(), key=lambda pair: pair[1]["share"])
     each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
-    return (
-        f"robust: {whole['robust_n']} held grasps hold in {whole['robust_share']:.2f} of {whole['robust_models']} "
-        f"perturbed models\nby perturbed parameter: {each}"
-    )
+    models = f"{whole['robust_share']:.2f} of {whole['robust_models']} perturbed models"
+    return f"robust: {whole['robust_n']} held grasps hold in {models}\nby perturbed parameter: {each}"
 
 
 def _joint_map(text: str | None) -> dict[str, str]:

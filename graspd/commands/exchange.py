@@ -41,34 +41,20 @@ def export(
     object_: Annotated[str | None, typer.Option("--object", help="Object file; default: found by its digest.")] = None,
     unvalidated: UnvalidatedOption = False,
     every: EveryOption = False,
-    depth: Annotated[
-        str, typer.Option(help="Depth format: exr (float, metres) or png (16 bit, steps of 0.1 mm).")
-    ] = "exr",
-    best: Annotated[
-        int, typer.Option(min=0, help="For robots: maximum number of grasps, the best by epsilon; 0: all.")
-    ] = 0,
+    depth: Annotated[str, typer.Option(help="Depth: exr (float, metres) or png (16 bit, steps of 0.1 mm).")] = "exr",
+    best: Annotated[int, typer.Option(min=0, help="For robots: number of best grasps by epsilon; 0: all.")] = 0,
     tool: Annotated[
-        str | None,
-        typer.Option(
-            "--tool-frame", help="For robots: tool frame, a link of the hand or x y z qw qx qy qz in its root link."
-        ),
+        str | None, typer.Option("--tool-frame", help="For robots: link of the hand, or x y z qw qx qy qz in its root.")
     ] = None,
     speed: Annotated[float, typer.Option(help="For robots: share of the velocity limits.")] = 0.5,
-    arm: Annotated[
-        str | None, typer.Option(help="For robots: URDF of an arm; only grasps that it can execute are written.")
-    ] = None,
+    arm: Annotated[str | None, typer.Option(help="For robots: URDF of an arm; selects grasps in its reach.")] = None,
     mount: Annotated[str | None, typer.Option(help="Link of the arm on which the hand is mounted.")] = None,
     base: Annotated[
-        str | None,
-        typer.Option(help="Pose of the arm's base in the scene, or relative to a free object: x y z qw qx qy qz."),
+        str | None, typer.Option(help="Pose of the arm's base in the scene or object frame: x y z qw qx qy qz.")
     ] = None,
-    mount_pose: Annotated[
-        str | None, typer.Option(help="Pose of the hand's root link in the mount link: x y z qw qx qy qz.")
-    ] = None,
+    mount_pose: Annotated[str | None, typer.Option(help="Pose of the hand in the mount: x y z qw qx qy qz.")] = None,
     held_out: Annotated[float, typer.Option(help="For training: share of held-out objects.")] = 0.2,
-    noise: Annotated[
-        str, typer.Option(help="For training: noise model of a depth camera, stereo or structured_light.")
-    ] = "",
+    noise: Annotated[str, typer.Option(help="For training: noise of depth, stereo or structured_light.")] = "",
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("export"),
     json: JsonFlag = False,
 ) -> None:
@@ -82,8 +68,8 @@ def export(
             from graspd.exchange.robot_export import RobotExportOptions, export_grasps
 
             of_robot = (best, tool, speed, arm, mount, base, mount_pose)
-            wishes = RobotExportOptions(hand, object_, unvalidated, every, *of_robot)
-            done = export_grasps(source, format_, wishes, output)
+            robot = RobotExportOptions(hand, object_, unvalidated, every, *of_robot)
+            done = export_grasps(source, format_, robot, output)
         elif format_ in TRAINING:
             from graspd.exchange.training_export import TrainingExportOptions, export_training
 
@@ -102,9 +88,7 @@ def export(
         typer.echo(note, err=True)
 
 
-@app.command(
-    "import", epilog="graspd import grasps.npy --format dexgraspnet --hand shadow --object mug.obj -o imported"
-)
+@app.command("import", epilog="graspd import grasps.npy --format dexgraspnet --hand shadow --object mug.obj")
 def import_(
     source: Annotated[Path, typer.Argument(help="File or folder of grasps.")],
     format_: Annotated[str, typer.Option("--format", help=", ".join(IMPORTS) + ".")],
@@ -115,9 +99,7 @@ def import_(
     robot: Annotated[str, typer.Option(help="multidex: name of the robot in the file.")] = "",
     name: Annotated[str, typer.Option(help="multidex, graspgen, huggingface, lerobot: name of the object.")] = "",
     number: Annotated[int, typer.Option(help="ddgc, dexgraspnet2: number of the object in the scene.")] = 0,
-    validation: Annotated[
-        str, typer.Option(help="Level of validation: dexgraspbench, standard, fast or none.")
-    ] = "standard",
+    validation: Annotated[str, typer.Option(help="Level: dexgraspbench, standard, fast or none.")] = "standard",
     friction: Annotated[float, typer.Option(help="Coulomb friction coefficient of the metrics.")] = 1.0,
     threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core.")] = 0,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("imported"),
@@ -136,12 +118,11 @@ def import_(
     options: dict[str, Any] = {"robot": robot, "object_name": name, "number": number}
     sets = read_sets(format_, source, hand, object_, options)
     said, run = Origin(format_, origin, licence), ExecutionContext(threads=threads)
-    files = [
-        write_scored(one, said, output, validation=validation, friction=friction, ordinal=k, run=run)
+    found = [
+        _summary(write_scored(one, said, output, validation=validation, friction=friction, ordinal=k, run=run))
         for k, one in enumerate(sets)
     ]
     (output / "source.json").write_text(jsonlib.dumps(vars(said), indent=1) + "\n")
-    found = [_summary(file) for file in files]
     lines = []
     for one in found:
         validated = "not validated" if validation == "none" else f"{one['valid']} valid at level {validation}"
@@ -154,10 +135,7 @@ def import_(
 
 
 def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, options: dict[str, Any]) -> list[Any]:
-    """Return the sets of grasps in a file of that format.
-
-    `hand` is a URDF or built-in, `obj` a mesh at scale 1; the object's name is optional in a file of a single object.
-    """
+    """Return the sets of grasps in a file; `hand` is a URDF or built-in hand, `obj` a mesh at scale 1."""
     from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, huggingface, lerobot, published
 
     if format_ not in IMPORTS:
@@ -170,7 +148,7 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
         raise InputError(f"{format_} files contain neither hand nor object; give --hand and --object")
     if format_ == "multidex" and not (options["robot"] and options["object_name"]):
         raise InputError("a multidex file contains many robots and objects; select one of each by --robot and --name")
-    # Reader of each format, with its options.
+    # Reader of each format, and names of its options.
     readers: dict[str, tuple[Callable[..., list[Any]], tuple[str, ...]]] = {
         "dexgraspbench": (dexgraspbench.read, ()),
         "dexlearn": (dexgraspbench.read, ()),
@@ -239,16 +217,12 @@ def _summary(file: Path) -> dict[str, Any]:
 
 @app.command(epilog="graspd datasets card kitchen -o kitchen-v1 --licence CC-BY-4.0")
 def card(
-    source: Annotated[
-        str, typer.Argument(metavar="NAME", help="Dataset of the store, or folder of shards, such as ./kitchen-v1.")
-    ],
+    source: Annotated[str, typer.Argument(metavar="NAME", help="Dataset of the store, or folder: ./kitchen-v1.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the card.")],
     snapshot: Annotated[str | None, typer.Option(help="Digest of a snapshot; default: the newest.")] = None,
     licence: Annotated[str, typer.Option(help="SPDX licence of grasps and pictures, such as CC-BY-4.0.")] = "",
     text: Annotated[str, typer.Option("--source", help="Origin or contact, in one sentence.")] = "",
-    assets: Annotated[
-        Path | None, typer.Option(help="JSON file with missing licences and sources of hands and objects.")
-    ] = None,
+    assets: Annotated[Path | None, typer.Option(help="JSON file of missing licences and sources of assets.")] = None,
     data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
@@ -269,15 +243,11 @@ def card(
     console = plain_console(stderr=True)
     with Progress(*columns, console=console, disable=json or not console.is_terminal, transient=True) as bar:
         task = bar.add_task("", total=len(contents.shards))
-
-        def show(done: int, total: int) -> None:
-            bar.update(task, completed=done)
-
-        found = write_card(contents, out, licence=licence, source=text, progress=show)
+        found = write_card(
+            contents, out, licence=licence, source=text, progress=lambda done, _: bar.update(task, completed=done)
+        )
     made = found["composition"]
     told = {"out": str(out), "dataset": found["name"], "snapshot": (found["snapshot"] or {}).get("digest")}
     told |= {"grasps": made["grasps"], "valid": made["valid"], "pictures": made["pictures"], "plots": found["plots"]}
-    plots = len(found["plots"])
-    print_result(
-        told, f"{out}/README.md: {made['valid']:,} valid grasps, {plots} plots, checksums, card.json", json=json
-    )
+    line = f"{out}/README.md: {made['valid']:,} valid grasps, {len(found['plots'])} plots, checksums, card.json"
+    print_result(told, line, json=json)

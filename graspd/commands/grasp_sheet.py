@@ -41,13 +41,9 @@ from graspd.worker.rendering.trajectory_pictures import (
 )
 
 Kind = Literal["one side", "three sides", "trajectory"]
-#: Edge of a grasp's picture [px], and rays per pixel. Path tracing time grows with both: three small pictures take half
-#: as long as one large picture.
-LOOKS: Final[dict[Kind, tuple[int, int]]] = {
-    "one side": (300, SAMPLES),
-    "three sides": (160, 8),
-    "trajectory": (300, SAMPLES),
-}
+#: Edge of a grasp's picture [px], and rays per pixel.
+_LARGE: Final = (300, SAMPLES)
+LOOKS: Final[dict[Kind, tuple[int, int]]] = {"one side": _LARGE, "three sides": (160, 8), "trajectory": _LARGE}
 
 
 @dataclass(frozen=True)
@@ -133,7 +129,7 @@ def _waypoint(trajectory: list[Waypoint], name: str) -> Waypoint:
 WIDTH: Final = 480
 HIGH: Final = 0.75
 
-#: Rays per pixel: noise is more visible in moving shadows.
+#: Rays per pixel of an animation.
 FILM_SAMPLES: Final = 24
 #: Used share of the velocity limits of joints and hand.
 SPEED: Final = 0.5
@@ -192,6 +188,5 @@ def waypoints(found: Executions, trajectory: RobotTrajectory) -> list[Waypoint]:
     held = trajectory.phase.index("lift")
     carried = np.where(np.arange(len(poses))[:, None] < held, 0.0, poses[:, :3] - poses[held - 1, :3])
     closed = trajectory.phase.index("squeeze") - 1
-    return [
-        Waypoint("grasp" if k == closed else "", pose, trajectory.joints[k], carried[k]) for k, pose in enumerate(poses)
-    ]
+    names = ["grasp" if k == closed else "" for k in range(len(poses))]
+    return [Waypoint(*row) for row in zip(names, poses, trajectory.joints, carried, strict=True)]

@@ -30,25 +30,12 @@ app = CommandGroup(add_completion=False)
 @app.command("check", epilog="graspd hands check my_hand.urdf --palm base_link --approach 0,0,1 --picture my_hand.png")
 @with_options(HandWords, "asset")
 def check(
-    file: Annotated[
-        str, typer.Argument(help="URDF, xacro or MJCF file, its folder, a ZIP of it, or name of a built-in hand.")
-    ],
+    file: Annotated[str, typer.Argument(help="URDF, xacro or MJCF file, its folder or ZIP, or a built-in hand.")],
     options: dict[str, Any],
-    picture: Annotated[
-        Path | None, typer.Option(help="PNG of the hand from two sides: open, in its pre-shape, and closing.")
-    ] = None,
-    collision: Annotated[
-        bool, typer.Option("--collision", help="Draw collision shapes instead of visual meshes.")
-    ] = False,
-    write: Annotated[
-        Path | None, typer.Option(help="Write all settings and guesses to an asset.json, for correction.")
-    ] = None,
-    self_test: Annotated[
-        bool,
-        typer.Option(
-            "--self-test/--no-self-test", help="Run the self-test: 64 grasps of simple shapes, 16 lifts off a table."
-        ),
-    ] = True,
+    picture: Annotated[Path | None, typer.Option(help="PNG of the hand: open, in its pre-shape, and closing.")] = None,
+    collision: Annotated[bool, typer.Option("--collision", help="Draw collision shapes, not visual meshes.")] = False,
+    write: Annotated[Path | None, typer.Option(help="Write all settings and guesses to an asset.json.")] = None,
+    self_test: Annotated[bool, typer.Option(help="Run the self-test: 64 grasps of simple shapes, 16 lifts.")] = True,
     json: JsonFlag = False,
 ) -> None:
     """Check whether a hand can be used, report guesses, and run the self-test. Needs no server."""
@@ -87,11 +74,9 @@ def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[ExecutionContex
     # Outside a terminal, the end of the progress bar would print an empty line.
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
         task = bar.add_task(first, total=1.0)
-
-        def tell(done: float, total: float, message: str) -> None:
-            bar.update(task, completed=done / total, description=message)
-
-        yield ExecutionContext(progress=tell)
+        yield ExecutionContext(
+            progress=lambda done, total, message: bar.update(task, completed=done / total, description=message)
+        )
 
 
 def _draw(hand: HandModel, picture: Path, *, collision: bool) -> None:

@@ -7,7 +7,7 @@ import os
 import signal
 import socket
 import threading
-from functools import partial
+from contextlib import closing
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated
@@ -15,9 +15,9 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from graspd.commands.grasp_sheet import GraspAnimation, GraspSheet
+from graspd.commands.grasp_sheet import GraspAnimation, GraspSheet, Kind
 from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_result, write_output
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import supports_in
@@ -59,23 +59,13 @@ def render(
     baseline: Annotated[float, typer.Option(help="Stereo baseline [m].")] = BASELINE_M,
     width: Annotated[int | None, typer.Option(min=16, max=4096, help="Picture width [px]; default: 320.")] = None,
     height: Annotated[int | None, typer.Option(min=16, max=4096, help="Picture height [px]; default: 240.")] = None,
-    channels: Annotated[
-        str, typer.Option(help="Channels besides rgb, depth and segmentation: distance, normals, occlusion, or all.")
-    ] = "",
-    cameras: Annotated[
-        Path | None, typer.Option(help="JSON file with intrinsics, poses, or both, instead of sampled cameras.")
-    ] = None,
-    with_hand: Annotated[
-        Path | None, typer.Option(help="Base shard, for additional pictures with the best grasp of each scene.")
-    ] = None,
+    channels: Annotated[str, typer.Option(help="More channels: distance, normals, occlusion, or all.")] = "",
+    cameras: Annotated[Path | None, typer.Option(help="JSON file with intrinsics, poses, or both, of cameras.")] = None,
+    with_hand: Annotated[Path | None, typer.Option(help="Base shard, to draw the best grasp of each scene.")] = None,
     hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
-    with_: Annotated[
-        list[str] | None, typer.Option("--with", help="File of a neighbour; default: the built-in object of that name.")
-    ] = None,
+    with_: Annotated[list[str] | None, typer.Option("--with", help="File of a neighbour; default: built-in.")] = None,
     object: _Object = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the cameras; default: the seed of the scenes.")
-    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the cameras; default: that of the scenes.")] = None,
     device: _Device = "auto",
     output: Annotated[Path, typer.Option("--output", "-o", help="Views shard to write.")] = Path("views.h5"),
     page: Annotated[Path | None, typer.Option(help="Contact sheet of the views to write (PNG).")] = None,
@@ -110,7 +100,9 @@ def render(
             seed=number,
             baseline_m=baseline,
             extras=extras,
-            run=ExecutionContext(used, progress=partial(_update_bar, bar, task)),
+            run=ExecutionContext(
+                used, progress=lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
+            ),
         )
     seconds = perf_counter() - started
     inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
@@ -131,30 +123,16 @@ def pictures(
     grasps: Annotated[Path, typer.Argument(help="Base shard, as written by `graspd synth`.")],
     count: Annotated[
         int | None,
-        typer.Option(
-            "--count",
-            "-n",
-            min=1,
-            max=400,
-            help="Number of best grasps; default: 12, with --trajectory 4, with --animate 1.",
-        ),
+        typer.Option("--count", "-n", min=1, max=400, help="Best grasps; default: 12, --trajectory 4, --animate 1."),
     ] = None,
     three: Annotated[bool, typer.Option("--three-sides", help="Draw each grasp from three sides.")] = False,
-    trajectory: Annotated[
-        bool, typer.Option("--trajectory", help="Draw the trajectory of each grasp: standoff, pregrasp, grasp, lift.")
-    ] = False,
-    animate: Annotated[
-        bool, typer.Option("--animate", help="Animate approach, closing and lift: .gif, .webp or .png.")
-    ] = False,
-    row: Annotated[
-        list[int] | None, typer.Option("--row", min=0, help="Row of a grasp in the file; repeatable.")
-    ] = None,
+    trajectory: Annotated[bool, typer.Option("--trajectory", help="Draw the postures of each trajectory.")] = False,
+    animate: Annotated[bool, typer.Option("--animate", help="Animate trajectories: .gif, .webp or .png.")] = False,
+    row: Annotated[list[int] | None, typer.Option(min=0, help="Row of a grasp in the file; repeatable.")] = None,
     palette: Annotated[bool, typer.Option("--palette", help="Use 256 colours, for a third of the file size.")] = False,
     size: Annotated[
         int | None,
-        typer.Option(
-            min=32, max=2048, help="Edge of a picture [px]; default: 300, with --three-sides 160, with --animate 480."
-        ),
+        typer.Option(min=32, max=2048, help="Edge of a picture [px]; default: 300, --three-sides 160, --animate 480."),
     ] = None,
     hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
     object: _Object = None,
@@ -181,10 +159,9 @@ def pictures(
     if animate:
         page = GraspAnimation(base, *models, run, size).file(output.suffix)
     else:
-        sheet = GraspSheet(
-            base, *models, "trajectory" if trajectory else "three sides" if three else "one side", run, size
-        )
-        page = sheet.png(subtitle=f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}")
+        kind: Kind = "trajectory" if trajectory else "three sides" if three else "one side"
+        subtitle = f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}"
+        page = GraspSheet(base, *models, kind, run, size).png(subtitle=subtitle)
     write_output(output, with_palette(page) if palette and not animate else page)
     told = {"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()}
     print_result(told, f"{output}: {'' if row else 'the best '}{len(rows)} of {among} {word}", json=json)
@@ -202,8 +179,7 @@ def _named_rows(base: Shard, rows: list[int], chosen: NDArray[np.bool_], word: s
 def _scenes(path: Path) -> Shard:
     shard = read_shard(path)
     if shard.kind == "base" and "scene/object_pose" not in shard.arrays:
-        fix = "a scene shard is needed here; make one: graspd scene"
-        raise InputError(f"{path} has grasps around a free object: {fix}")
+        raise InputError(f"{path} has free grasps: a scene shard is needed here; make one: graspd scene")
     if shard.kind == "views":
         raise InputError(f"{path} is a views shard; a scene shard is needed here")
     return shard
@@ -229,27 +205,20 @@ def _hand_in_pictures(scene: Shard, base_file: Path | None, hand: str | None) ->
     model = hand_of_shard(scene, hand)
     hand_of_shard(base, hand)
     if source.max() >= len(base["grasp/joint_positions"]):
-        fix = "give the base shard of these scenes"
-        raise InputError(f"{base_file} has fewer grasps than the scenes refer to; {fix}")
+        raise InputError(f"{base_file} has fewer grasps than its scenes refer to; give the base shard of these scenes")
     rows = best_transferred_rows(scene.arrays, base.arrays)
     joints = np.asarray(base["grasp/joint_positions"], float)[source[rows]]
     poses = np.asarray(scene["grasp/hand_pose"], float)[rows]
     return DrawnHand(model, rows, poses, joints, wrists_of(scene, rows))
 
 
-def _update_bar(bar: Progress, task: TaskID, done: float, total: float, message: str) -> None:
-    bar.update(task, completed=done, total=total, description=message)
-
-
 @app.command(epilog="graspd view grasps.h5")
 def view(
     grasps: Annotated[Path, typer.Argument(help="Base shard, as written by `graspd synth`.")],
-    host: Annotated[
-        str, typer.Option(help="Address to bind; everyone with access to it sees the grasps.")
-    ] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="Address to bind; everybody with access sees it.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="First port to try; 0: any free port.")] = 8080,
     hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
-    object: Annotated[str | None, typer.Option(help="Object file; default: found by its digest.")] = None,
+    object: _Object = None,
 ) -> None:
     """Show grasps in 3D in the browser: hand, object, scene, contacts, trajectory. Ends with Ctrl-C."""
     from graspd.worker.viewing import Viewer, ViewerContent, missing_viewer_text
@@ -261,19 +230,16 @@ def view(
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
-    viewer = Viewer(shown, host=host, port=port)
-    try:
+    with closing(Viewer(shown, host=host, port=port)) as viewer:
         typer.echo(f"{grasps}: {viewer.url}")
         command = forwarding_command(viewer.server.get_port())
         typer.echo(f"from another machine: run {command}, then open the same address; Ctrl-C ends the viewer")
         ended.wait()
-    finally:
-        viewer.close()
 
 
 def forwarding_command(port: int) -> str:
     """Return the ssh command that forwards a port of this machine's loopback to the user's machine."""
-    # sshd sets the address at which this machine was reached.
-    reached = os.environ.get("SSH_CONNECTION", "").split()
-    host = reached[2] if len(reached) == 4 else socket.gethostname()
+    # Third word: address at which sshd was reached.
+    connection = os.environ.get("SSH_CONNECTION", "").split()
+    host = connection[2] if len(connection) == 4 else socket.gethostname()
     return f"ssh -L {port}:127.0.0.1:{port} {getpass.getuser()}@{host}"

@@ -37,28 +37,23 @@ def scene(
     scenes: Annotated[int, typer.Option(min=1, max=4096, help="Number of scenes.")] = 2,
     hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
     object: Annotated[str | None, typer.Option(help="Object file; default: found by its digest.")] = None,
-    with_: Annotated[
-        list[str] | None, typer.Option("--with", help="Neighbour on the table: file or built-in object; repeatable.")
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the scenes; default: the seed of the grasps.")
-    ] = None,
+    with_: Annotated[list[str] | None, typer.Option("--with", help="Neighbour: file or built-in; repeatable.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the scenes; default: that of the grasps.")] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="Scene shard to write.")] = Path("scenes.h5"),
     json: JsonFlag = False,
 ) -> None:
-    """Drop the object on a table and select the grasps that the hand can reach there."""
+    """Drop the object on a table and select the grasps that are clear there."""
     started = perf_counter()
     base = read_shard(grasps, kind="base")
     model, obj = hand_of_shard(base, hand), object_of_shard(base, object)
     number = int(base.attributes.get("seed", 0)) if seed is None else seed  # type: ignore[arg-type]
     others = [object_from_path(name, face_error_m=NEIGHBOUR_FACE_ERROR_M) for name in with_ or []]
-    result: dict[str, Any] = dict(
-        drop_together(obj, others, count=scenes, seed=number) if others else drop(obj, count=scenes, seed=number)
-    )
+    dropped = drop_together(obj, others, count=scenes, seed=number) if others else drop(obj, count=scenes, seed=number)
+    result: dict[str, Any] = dict(dropped)
     poses = result["scene/object_pose"]
-    beside = Neighbours(others, result["scene/neighbour_pose"]) if others else None
+    neighbours = Neighbours(others, result["scene/neighbour_pose"]) if others else None
     grasp, pregrasp = (Posture.from_columns(base.arrays, name) for name in ("grasp", "pregrasp"))
-    result |= transfer_grasps(model, grasp, pregrasp, poses, beside)
+    result |= transfer_grasps(model, grasp, pregrasp, poses, neighbours)
     seconds = perf_counter() - started
     attributes: dict[str, Attribute] = {key: base.attributes[key] for key in INHERITED if key in base.attributes}
     attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)}

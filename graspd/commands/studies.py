@@ -23,8 +23,7 @@ from graspd.service.model.renamed import convert_chart
 from graspd.service.model.scene_spec import SceneSpec, parse_scene
 from graspd.service.model.studies import Stability, from_json
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.service.store.records import STABILITY, chart_kind
-from graspd.service.store.records import publish_record as publish_record
+from graspd.service.store.records import STABILITY, chart_kind, publish_record
 from graspd.service.store.store import open_store
 from graspd.worker.engines.devices import Device
 from graspd.worker.execution_context import ExecutionContext
@@ -41,9 +40,7 @@ def bench(
     join: Annotated[list[int] | None, typer.Option(min=1, help="Batches per launch; repeatable.")] = None,
     threads: Annotated[list[int] | None, typer.Option(min=1, help="CPU threads; repeatable.")] = None,
     points: Annotated[list[int] | None, typer.Option(min=16, help="Also measure these numbers of hand points.")] = None,
-    face_error: Annotated[
-        list[float] | None, typer.Option(min=0, help="Also measure these face error bounds [m].")
-    ] = None,
+    face_error: Annotated[list[float] | None, typer.Option(min=0, help="Also measure these face errors [m].")] = None,
     device: Annotated[str, typer.Option(help="Device: cpu, cuda:0 or auto.")] = "auto",
     repeats: Annotated[int, typer.Option(min=1, help="Timed calls per run, of which the median is reported.")] = 3,
     out: Annotated[Path | None, typer.Option(help="Folder for bench.json, bench.md and bench.png.")] = None,
@@ -73,7 +70,7 @@ def bench(
 
 
 def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[float] | None) -> list[Fidelity]:
-    """Return the named fidelities, then variants of the first one with one setting changed at a time."""
+    """Return the named fidelities, then variants of the first fidelity with one changed setting each."""
     chosen = _check_fidelities(names or OFFERED)
     found = [FIDELITIES[name] for name in chosen]
     changes: list[dict[str, Any]] = [{"fine_points": n, "name": f"{chosen[0]}/points={n}"} for n in points or []]
@@ -103,10 +100,7 @@ def stability(
     long: Annotated[bool, typer.Option("--long", help="Add runs of 100,000 iterations.")] = False,
     threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for stability.json, stability.md and the maps.")] = None,
-    source: Annotated[
-        list[Path] | None,
-        typer.Option("--from", help="Use the maps of a stability.json instead of measuring; repeatable."),
-    ] = None,
+    source: Annotated[list[Path] | None, typer.Option("--from", help="Use a stability.json; repeatable.")] = None,
     publish: Annotated[bool, typer.Option("--publish", help="Publish to the store, for the dashboard.")] = False,
     data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
@@ -117,7 +111,7 @@ def stability(
     if unknown := [name for name in only or [] if name not in STUDIES]:
         raise InputError(f"there is no study {unknown[0]!r}; choose one of {choices_text(unknown[0], STUDIES)}")
     if source:
-        found = _merge([_read_maps(path) for path in source])
+        found = _merge([_read(path, "stability", from_json) for path in source])
         found = replace(found, maps=[one for one in found.maps if not only or one.name in only])
     else:
         found = _measure(tuple(only or STUDIES), hand, object_, quick=quick, long=long, threads=threads)
@@ -144,18 +138,13 @@ def _measure(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: 
 
 
 def _read(path: Path, kind: str, parse: Callable[[Any], Any]) -> Any:
-    """Parse a JSON file of `graspd KIND --out`; InputError for any other file."""
+    """Parse a JSON file of `graspd KIND --out`; raise InputError for any other file."""
     try:
         return parse(loads(path.read_text()))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError):
         raise InputError(f"{path} is no {kind}.json; `graspd {kind} --out FOLDER` writes one") from None
-
-
-def _read_maps(path: Path) -> Stability:
-    found: Stability = _read(path, "stability", from_json)
-    return found
 
 
 def _merge(parts: list[Stability]) -> Stability:
@@ -185,41 +174,22 @@ def chart(
     ] = ",".join(PEERS),
     hands: Annotated[str, typer.Option(help="URDFs or built-in hands, separated by commas.")] = "allegro,barrett",
     objects: Annotated[str, typer.Option(help="Meshes or built-in objects, separated by commas.")] = "mug,bottle",
-    fidelities: Annotated[
-        str, typer.Option(help="Fidelities of methods that have them, separated by commas.")
-    ] = ",".join(OFFERED),
-    batch: Annotated[
-        str, typer.Option(help="Grasps per call; several values, separated by commas, are all measured.")
-    ] = "32",
+    fidelities: Annotated[str, typer.Option(help="Fidelities, separated by commas.")] = ",".join(OFFERED),
+    batch: Annotated[str, typer.Option(help="Grasps per call: one or several numbers, separated by commas.")] = "32",
     baseline_batch: Annotated[int, typer.Option(min=1, help="Grasps per call of methods with a budget of steps.")] = 8,
     repeats: Annotated[int, typer.Option(min=1, help="Timed calls per setting, hand and object.")] = 2,
-    option: Annotated[
-        list[str] | None,
-        typer.Option(help="Option of a method as METHOD:NAME=VALUE, such as graspit:steps=40000; repeatable."),
-    ] = None,
+    option: Annotated[list[str] | None, typer.Option(help="Option of a method: graspit:steps=40000.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Small run: seconds instead of an hour.")] = False,
     sweep: Annotated[bool, typer.Option("--sweep", help="Vary the settings of fast_graspd, one at a time.")] = False,
-    knob: Annotated[
-        list[str] | None,
-        typer.Option(help="With --sweep: vary only this setting, such as 'contact solver'; repeatable."),
-    ] = None,
+    knob: Annotated[list[str] | None, typer.Option(help="With --sweep: only this setting; repeatable.")] = None,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
     device: Annotated[str, typer.Option(help="Device: cpu, cuda:0 or auto.")] = "auto",
     out: Annotated[Path | None, typer.Option(help="Folder for chart.json, .csv, .md, .png and .svg.")] = None,
     remark: Annotated[str, typer.Option(help="Note on the conditions, for the report.")] = "",
-    scene: Annotated[
-        str,
-        typer.Option(
-            help="free, table, bin, shelf or a file. In a scene, free grasps transferred to it are compared too."
-        ),
-    ] = "free",
-    work: Annotated[
-        Path | None, typer.Option(help="With --scene: folder of results, in which a stopped run continues.")
-    ] = None,
+    scene: Annotated[str, typer.Option(help="free, table, bin, shelf or a file.")] = "free",
+    work: Annotated[Path | None, typer.Option(help="With --scene: folder in which a stopped run continues.")] = None,
     source: Annotated[Path | None, typer.Option("--from", help="Use a chart.json instead of measuring.")] = None,
-    publish: Annotated[
-        bool, typer.Option("--publish", help="Publish to the store, for the dashboard and `fidelity: auto`.")
-    ] = False,
+    publish: Annotated[bool, typer.Option("--publish", help="Publish to the store, for `fidelity: auto`.")] = False,
     data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
@@ -243,15 +213,8 @@ def chart(
         hands, objects, fidelities = (_parts(text)[0] for text in (hands, objects, fidelities))
         batches, baseline_batch, repeats, models_around = [4], 2, 1, 2
     levels = _check_fidelities(_parts(fidelities))
-    chosen = settings_of(
-        _parts(methods),
-        levels,
-        batches=batches,
-        baseline_batch=baseline_batch,
-        options=option or [],
-        quick=quick,
-        run=on,
-    )
+    sizes: dict[str, Any] = {"batches": batches, "baseline_batch": baseline_batch}
+    chosen = settings_of(_parts(methods), levels, options=option or [], quick=quick, run=on, **sizes)
     models, things = [hand_from_path(part) for part in _parts(hands)], _chart_objects(_parts(objects))
     said = {"command": shlex.join(["graspd", *(_without_folders(word) for word in sys.argv[1:])]), "remark": remark}
 

@@ -45,7 +45,6 @@ def synth(
 ) -> None:
     """Generate, validate and measure grasps of one hand on one object as a job does; write an HDF5 file.
 
-    A grasp in a scene is valid if approach, closing and lift touch nothing else and the lifted object is held.
     Exit code 3: fewer grasps than requested. Ctrl-C saves the validated grasps.
     """
     from graspd.worker.files.provenance import id_of_columns  # Help and completion need no engine.
@@ -108,12 +107,9 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
 
 def _format_robustness(found: dict[str, Any]) -> str:
     share, not_robust = found["robust_share"], found["not_robust"]
-    if share is None:
-        return (
-            f"no grasp is robust; {not_robust} hold in the nominal model, but in too few of "
-            f"{found['robust_models']} perturbed models"
-        )
     models = f"of {found['robust_models']} perturbed models"
+    if share is None:
+        return f"no grasp is robust; {not_robust} hold in the nominal model, but in too few {models}"
     if not (wanted := found["robust_wanted"]) or found["want"] != "valid":
         return f"the valid grasps hold in {share:.0%} {models}"
     return f"each grasp holds in at least {wanted:.0%} {models}; {not_robust} held grasps are not robust"

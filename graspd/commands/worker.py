@@ -7,6 +7,7 @@ import socket
 import sys
 import threading
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -25,24 +26,15 @@ app = CommandGroup(no_args_is_help=True)
 def worker(
     device: Annotated[str | None, typer.Option(help="Device: cpu, cuda:0 or auto; default: GRASPD_DEVICE.")] = None,
     stages: Annotated[str | None, typer.Option(help="Stages to serve, separated by commas; default: all.")] = None,
-    workers: Annotated[
-        int, typer.Option(min=1, help="Worker processes; with device auto each takes the next GPU.")
-    ] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Worker processes; with device auto, one per GPU.")] = 1,
     threads: Annotated[int | None, typer.Option(min=0, help="CPU threads; 0: all; default: GRASPD_THREADS.")] = None,
-    join: Annotated[
-        str | None, typer.Option(help="Batches of a task per launch of the planner, or auto; default: GRASPD_JOIN.")
-    ] = None,
-    processes: Annotated[
-        int | None,
-        typer.Option(min=0, help="Processes for validation and metrics; 0: automatic; default: GRASPD_PROCESSES."),
-    ] = None,
+    join: Annotated[str | None, typer.Option(help="Batches per launch, or auto; default: GRASPD_JOIN.")] = None,
+    processes: Annotated[int | None, typer.Option(min=0, help="Processes for validation; 0: automatic.")] = None,
     burst: Annotated[bool, typer.Option("--burst", help="Exit when no task waits.")] = False,
     idle: Annotated[int, typer.Option(min=0, help="With --burst: exit after this time without a task [s].")] = 0,
     once: Annotated[bool, typer.Option("--once", help="Exit after one task.")] = False,
     max_tasks: Annotated[int | None, typer.Option(min=1, help="Exit after this many tasks.")] = None,
-    check: Annotated[
-        bool, typer.Option("--check", help="Only check for a live worker on this host; exit code 1 if there is none.")
-    ] = False,
+    check: Annotated[bool, typer.Option("--check", help="Check for a live worker here; exit code 1: none.")] = False,
     data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
 ) -> None:
     """Run one or several workers, each on one device, until stopped."""
@@ -66,9 +58,9 @@ def worker(
     with pause_garbage_collection():
         from graspd.worker.process.main import run_worker
 
-    ended_well = run_worker(
-        settings, stages=_parse_stages(stages), burst=burst or once, idle_s=idle, max_tasks=1 if once else max_tasks
-    )
+    most = 1 if once else max_tasks
+    served = _parse_stages(stages)
+    ended_well = run_worker(settings, stages=served, burst=burst or once, idle_s=idle, max_tasks=most)
     raise typer.Exit(0 if ended_well else 1)
 
 
@@ -118,12 +110,9 @@ def check_worker(settings: Settings) -> None:
     from graspd.service.queue.rq_queue import open_queue
 
     host = socket.gethostname()
-    queue = open_queue(settings, patience=0)
-    try:
+    with closing(open_queue(settings, patience=0)) as queue:
         if not any(beat.host == host for beat in queue.workers()):
             raise UnavailableError(f"no worker on {host} sent a heartbeat lately; start `graspd worker`")
-    finally:
-        queue.close()
 
 
 def _parse_stages(text: str | None) -> tuple[Stage, ...]:

@@ -1,4 +1,4 @@
-"""Condition of an index, read without opening the index, because opening changes it."""
+"""Condition of an index database, read without changes: `Database` would make or alter its tables."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from sqlalchemy import URL, make_url, text
 from graspd.service.index.database import (
     REVISION,
     REVISION_TABLE,
-    UNUSABLE,
     connect_postgres,
     convert_errors,
+    convert_url_errors,
     revision_of,
-    url_error,
 )
 from graspd.service.model.errors import IndexDamaged, IndexUnavailable
 
@@ -43,14 +42,11 @@ class IndexCondition:
 
 
 def read_condition(url: str | URL) -> IndexCondition | None:
-    """Return the condition of an index, None if it has no file; errors as in `Database`, or IndexDamaged."""
-    try:
-        parsed = make_url(url)
-        if parsed.get_backend_name() == "sqlite":
+    """Return the condition of an index, None without a file; errors of `Database`, or IndexDamaged."""
+    with convert_url_errors():
+        if (parsed := make_url(url)).get_backend_name() == "sqlite":
             return _file_condition(Path(str(parsed.database)))
         return _postgres_condition(url)
-    except UNUSABLE as error:
-        raise url_error(error) from None
 
 
 def _file_condition(path: Path) -> IndexCondition | None:
@@ -58,9 +54,8 @@ def _file_condition(path: Path) -> IndexCondition | None:
         return None
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=_TIMEOUT_S)) as connection:
-            said = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
-            if said != "ok":
-                raise IndexDamaged(f"the index {path} is damaged: {said}")
+            if (result := connection.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
+                raise IndexDamaged(f"the index {path} is damaged: {result}")
             tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
             query = f"SELECT version_num FROM {REVISION_TABLE}"
             rows = connection.execute(query).fetchall() if REVISION_TABLE in tables else []

@@ -1,8 +1,7 @@
 """Connection to the index database, SQLite in WAL mode or PostgreSQL; the first open makes the tables.
 
-There are no migrations, because the index follows from the store: `graspd admin index rebuild` replaces an index of
-another revision. Columns of new metrics are added when it opens; grasps without such a value have NULL. The column of
-a removed metric stays.
+There are no migrations: `graspd admin index rebuild` replaces an index of another revision. Columns of new metrics are
+added, with NULL for existing grasps; columns of removed metrics stay.
 """
 
 from __future__ import annotations
@@ -48,6 +47,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
 from graspd.service.index.tables import assets, grasps, jobs, metadata, tasks
+from graspd.service.model.base import first_line
 from graspd.service.model.errors import IndexDamaged, IndexUnavailable, InputError, NotFoundError
 from graspd.service.model.metrics import indexed_metrics
 from graspd.service.model.projects import ProjectScope
@@ -56,15 +56,14 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 #: Revision of `service.index.tables`: it changes with every change of the tables except for new metrics.
 REVISION: Final = "0022"
-#: Table with the revision. graspd 0.2 reads it, and refuses an index of an unknown revision.
+#: Table with the revision. graspd 0.2 also reads this table, and refuses an index of an unknown revision.
 REVISION_TABLE: Final = "alembic_version"
-#: Longest wait for other writers [s], whose transactions may take a few seconds.
+#: Maximum time to wait for other writers [s], whose transactions may take a few seconds.
 _BUSY_TIMEOUT_S: Final = 20.0
 #: Key of PostgreSQL's advisory lock that a process holds while it makes tables: "grsp" in ASCII.
 _TABLES_LOCK: Final = 0x67727370
 #: Key of the advisory lock that a process holds until its write transaction ends: "grsq" in ASCII.
 _TURN_LOCK: Final = 0x67727371
-UNUSABLE: Final = (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError)
 #: Codes of SQLite for a file with invalid content.
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
@@ -75,8 +74,7 @@ class Database:
     def __init__(self, url: str | URL, *, anew: bool = False) -> None:
         """Connect, and make the tables of an empty database; `anew` replaces tables of another revision.
 
-        Raises InputError for an unusable URL, IndexUnavailable if the database does not answer, is read-only or has
-        another revision.
+        InputError: unusable URL. IndexUnavailable: no answer, a read-only database, or another revision.
         """
         self._url = url
         self._anew = anew
@@ -106,17 +104,13 @@ class Database:
 
     @contextmanager
     def write_transaction(self, within: Connection | None = None) -> Iterator[Connection]:
-        """Yield the given transaction, or a new one that is committed as a whole or not at all.
-
-        Writers run one at a time, because a transaction derives states from rows that a concurrent one might
-        change.
-        """
+        """Yield the given transaction, or a new one, committed as a whole; only one runs at a time."""
         if within is not None:
             yield within
             return
         with self._handle_errors(), self._write_lock, self._current_engine().connect() as connection:
             if connection.dialect.name == "sqlite":
-                # Otherwise a transaction that reads before it writes fails at once if another one writes in between.
+                # A deferred transaction would fail at once if another one writes between its reads and writes.
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
             else:
                 connection.exec_driver_sql(f"SET LOCAL lock_timeout = '{_BUSY_TIMEOUT_S:g}s'")
@@ -139,7 +133,7 @@ class Database:
             return list(connection.scalars(query))
 
     def matching_rows(self, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]) -> list[Any]:
-        """Return the rows whose column has one of the wanted values; the number of values is unlimited."""
+        """Return the rows whose column has one of the wanted values, which may be any number of values."""
         with self.read_transaction() as connection:
             return list(rows_in(connection, query, column, wanted))
 
@@ -173,7 +167,7 @@ class Database:
         self._identity = self._file.identity() if self._file is not None else None
 
     def _current_engine(self) -> Engine:
-        """Return the engine; a new one if the file was removed or replaced meanwhile."""
+        """Return the engine, or a new one if the file was removed or replaced."""
         if self._file is not None and self._file.identity() != self._identity:
             with self._opening:
                 if self._file.identity() != self._identity:
@@ -204,7 +198,7 @@ class IndexPart:
 
 
 def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
-    """Yield parts of `ids` that fit into one statement: databases limit the number of parameters."""
+    """Yield parts of `ids` for one statement each, because databases limit the number of parameters."""
     return (ids[start : start + size] for start in range(0, len(ids), size))
 
 
@@ -217,28 +211,28 @@ def rows_in(
 
 def _file_of(url: str | URL) -> SqliteFile | None:
     """Return the file of an SQLite index, None if it has no file; InputError for an invalid URL."""
-    try:
+    with convert_url_errors():
         parsed = make_url(url)
         is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
-    except UNUSABLE as error:
-        raise url_error(error) from None
     return SqliteFile(Path(str(parsed.database))) if is_file else None
 
 
 def _engine(url: str | URL) -> Engine:
-    try:
+    with convert_url_errors():
         return _sqlite_engine(url) if make_url(url).get_backend_name() == "sqlite" else connect_postgres(url)
-    except UNUSABLE as error:
-        raise url_error(error) from None
 
 
-def url_error(error: Exception) -> InputError:
-    """Return the error for an unusable index URL, without SQLAlchemy's text, which may contain a password."""
-    why = f" ({_error_line(error)})" if isinstance(error, NoSuchModuleError | ModuleNotFoundError) else ""
-    return InputError(
-        f"the index URL (GRASPD_INDEX_URL) cannot be used{why}; give sqlite:///PATH or "
-        "postgresql+psycopg://HOST/NAME; in a password, write %2F for / and %40 for @"
-    )
+@contextmanager
+def convert_url_errors() -> Iterator[None]:
+    """Convert errors of an unusable index URL to InputError, without a text that may contain a password."""
+    try:
+        yield
+    except (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError) as error:
+        why = f" ({_error_line(error)})" if isinstance(error, NoSuchModuleError | ModuleNotFoundError) else ""
+        raise InputError(
+            f"the index URL (GRASPD_INDEX_URL) cannot be used{why}; give sqlite:///PATH or "
+            "postgresql+psycopg://HOST/NAME; in a password, write %2F for / and %40 for @"
+        ) from None
 
 
 def connect_postgres(url: str | URL) -> Engine:
@@ -278,9 +272,9 @@ def _make_tables(engine: Engine, *, anew: bool) -> str:
         if found and found != REVISION:
             if not anew:
                 raise IndexUnavailable(_revision_mismatch(found))
-            there = MetaData()
-            there.reflect(connection)
-            there.drop_all(connection)
+            existing = MetaData()
+            existing.reflect(connection)
+            existing.drop_all(connection)
             found, dropped = "", found
         if not found:
             metadata.create_all(connection)
@@ -306,7 +300,7 @@ def _revision_mismatch(found: str) -> str:
 
 @contextmanager
 def _schema_transaction(engine: Engine) -> Iterator[Connection]:
-    """Yield a transaction while no other process makes tables; all of it is committed, or nothing."""
+    """Yield a transaction, committed as a whole or not at all, while no other process makes tables."""
     with engine.connect() as connection:
         if connection.dialect.name == "postgresql":
             connection.execute(text("SELECT pg_advisory_lock(:key)"), {"key": _TABLES_LOCK})
@@ -334,22 +328,20 @@ def convert_errors() -> Iterator[None]:
         raise InputError("the index needs whole numbers below 2^63 and valid Unicode text; give such values") from None
     except SQLAlchemyError as error:
         if getattr(getattr(error, "orig", None), "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
-            raise IndexDamaged(
-                f"the index is damaged ({_error_line(error)}); a new one replaces it and is filled from the store"
-            ) from error
+            message = f"the index is damaged ({_error_line(error)}); a new one replaces it and is filled from the store"
+            raise IndexDamaged(message) from error
         raise IndexUnavailable(f"the index does not answer or cannot be written: {_error_line(error)}") from error
 
 
 def _error_line(error: Exception) -> str:
-    original = getattr(error, "orig", None) or error
-    return (str(original).strip().splitlines() or [type(original).__name__])[0]
+    return first_line(getattr(error, "orig", None) or error)
 
 
 def _add_missing_metrics(connection: Connection) -> list[str]:
-    """Add missing columns and indexes within the given transaction; return the names of the columns."""
+    """Add missing columns and indexes of the table `grasps`; return the names of the columns."""
     found = inspect(connection)
-    there = {column["name"] for column in found.get_columns(grasps.name)}
-    missing = [metric.name for metric in indexed_metrics() if metric.name not in there]
+    existing = {column["name"] for column in found.get_columns(grasps.name)}
+    missing = [metric.name for metric in indexed_metrics() if metric.name not in existing]
     for name in missing:
         kind = grasps.c[name].type.compile(connection.dialect)
         connection.exec_driver_sql(f"ALTER TABLE {grasps.name} ADD COLUMN {name} {kind}")
@@ -372,7 +364,7 @@ class SqliteFile:
         self.path = path
 
     def identity(self) -> Identity:
-        """Return device and inode of the named file, None if absent: another process may replace an open file."""
+        """Return device and inode of the file, None if absent; another process may replace the file."""
         try:
             facts = self.path.stat()
         except FileNotFoundError:
@@ -381,7 +373,7 @@ class SqliteFile:
 
     @contextmanager
     def lock_for_opening(self) -> Iterator[None]:
-        """Hold the inter-process lock, and remove files that belonged to a missing database."""
+        """Hold the inter-process lock; first remove the log files of a missing database."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             lock = self._sidecar(".lock").open("w")
@@ -395,7 +387,7 @@ class SqliteFile:
             yield
 
     def set_aside(self, damaged: Identity) -> None:
-        """Move a damaged file away, unless another process did so; requires the lock of `lock_for_opening`."""
+        """Move a damaged file away unless another process did; call within `lock_for_opening`."""
         if damaged is None or self.identity() != damaged:
             return
         suffix = f".damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}"
@@ -408,12 +400,11 @@ class SqliteFile:
         return self.path.with_name(f"{self.path.name}{name}")
 
 
-#: Rows are written by one statement per row, which SQLAlchemy builds faster than one statement for all rows.
 Row = Mapping[str, Any]
 
 
 def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: Sequence[str] = ()) -> None:
-    """Insert or update rows of the same columns; the last row of a key wins. `keep` is never updated."""
+    """Insert or update rows of equal columns; the last row of a key counts. `keep` is never updated."""
     if not rows:
         return
     keys = [column.name for column in table.primary_key]
@@ -427,7 +418,7 @@ def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: S
 
 
 def update_rows(connection: Connection, table: Table, rows: Sequence[Row], *, state: str) -> None:
-    """Update rows by `id`, except rows whose column `state` no longer equals `state`."""
+    """Update the rows with the given `id` whose column `state` still equals `state`."""
     if not rows:
         return
     values: dict[str, Any] = {name: bindparam(f"new_{name}") for name in rows[0] if name != "id"}
@@ -463,7 +454,7 @@ def asset_scope_order(scope: ProjectScope) -> ColumnElement[int]:
 
 
 def shard_scope_conditions(scope: ProjectScope, shard: ColumnElement[Any]) -> Tests:
-    """Return the conditions that a job of the scope's project makes or reuses a shard."""
+    """Return the condition that a job of the scope's project makes or reuses a shard."""
     wanted = (tasks.c.shard_id == shard, tasks.c.job_id == jobs.c.id, jobs.c.project == scope.project)
     return () if scope.everything else (exists().where(*wanted),)
 
@@ -481,7 +472,7 @@ def page_rows(
     cursor: str | None,
     descending: bool = True,
 ) -> tuple[Sequence[RowMapping], str | None]:
-    """Return a page's rows ordered by a key, and the next cursor; InputError as in `decode_cursor`."""
+    """Return the rows of a page, ordered by `key`, and the next cursor; InputError as in `decode_cursor`."""
     size = page_size(limit)
     if cursor is not None:
         start = decode_cursor(cursor, *(part.type.python_type for part in key))
@@ -500,11 +491,11 @@ def decode_cursor(cursor: str, *kinds: type | tuple[type, ...]) -> tuple[Any, ..
     try:
         key = from_json(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)), allow_inf_nan=False)
     except ValueError:
-        raise InputError("the cursor is not from this list; start without it") from None
+        raise InputError("the cursor is not from this list; start without a cursor") from None
     if not isinstance(key, list) or len(key) != len(kinds) or not all(map(isinstance, key, kinds)):
-        raise InputError("the cursor belongs to another list or another order; start without it")
+        raise InputError("the cursor belongs to another list or another order; start without a cursor")
     if any(isinstance(part, int) and not -_MOST <= part < _MOST for part in key):
-        raise InputError("the cursor is not from this list; start without it")
+        raise InputError("the cursor is not from this list; start without a cursor")
     return tuple(key)
 
 

@@ -1,4 +1,4 @@
-"""Tables of the index as Parquet files, for DuckDB, pandas and others."""
+"""Export of index tables as Parquet files, for DuckDB, pandas and others."""
 
 from __future__ import annotations
 
@@ -14,20 +14,18 @@ from graspd.service.index.tables import assets, attempts, dataset_cells, dataset
 from graspd.service.parquet import schema_of, write
 
 #: Exported tables. Other tables contain current state (workers, notes) or internal data.
-TABLES: Final[Mapping[str, Table]] = {
-    table.name: table for table in (grasps, shards, jobs, tasks, attempts, assets, datasets, dataset_cells, spent)
-}
-#: Rows in a row group; only one group is in memory at a time.
+_EXPORTED: Final = (grasps, shards, jobs, tasks, attempts, assets, datasets, dataset_cells, spent)
+TABLES: Final[Mapping[str, Table]] = {table.name: table for table in _EXPORTED}
+#: Number of rows per row group; only one group is in memory at a time.
 GROUP: Final = 20_000
 
 
 def export(database: Database, folder: Path) -> dict[str, int]:
-    """Write each of `TABLES` as `folder/NAME.parquet`, from one snapshot; return their row counts.
+    """Write `TABLES` as `folder/NAME.parquet`; return their row counts; InputError without pyarrow.
 
-    Integers are int64, other numbers float64, JSON is text. Rows are ordered by primary key. Raises InputError without
-    pyarrow.
+    Rows are of one snapshot, ordered by primary key. Integers are int64, other numbers float64, JSON is text.
     """
-    # The import precedes the query, so that a missing package is reported at once.
+    # The schemas need pyarrow: a missing package is reported before any query.
     schemas = {name: schema_of({c.name: _type_name(c) for c in table.columns}) for name, table in TABLES.items()}
     with database.read_transaction() as connection:
         return {

@@ -1,4 +1,4 @@
-"""The index of API and controller."""
+"""The index: all its parts on one database."""
 
 from __future__ import annotations
 

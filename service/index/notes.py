@@ -1,4 +1,4 @@
-"""Notes on the state of index and store: completeness, progress of the scan, damaged stored objects."""
+"""Notes of the index: completeness, mark, service id, integrity scan, damaged stored objects."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _CHANGES: Final = "changes"
 _MARK: Final = "mark"
 _SCAN_PAUSE: Final = "integrity scan pause"
 _SERVICE: Final = "service"
-#: Maximum number of stored names of damaged records; all are counted.
+#: Maximum number of damaged records that are stored by name; the count includes all.
 _NAMED: Final = 50
 
 
 @dataclass(frozen=True)
 class IndexCompleteness:
-    """State of a filled index: complete, perhaps except for unreadable records."""
+    """Completeness of a filled index: its time, and the damaged records that the index lacks."""
 
     at: str
     left_out: int = 0
@@ -34,7 +34,7 @@ class IndexCompleteness:
 
 @dataclass(frozen=True)
 class StoreMark:
-    """Mark by which an older copy of the index or of the store is detected."""
+    """Mark that detects an older copy of index or store, and the number of changes so far."""
 
     mark: str = ""
     """Mark that index and store share; empty before the first mark."""
@@ -45,7 +45,7 @@ class StoreMark:
 
 @dataclass(frozen=True)
 class ScanNote:
-    """Progress of the controller's integrity scan in this round."""
+    """Progress of the integrity scan: folder index and last key of the current round."""
 
     started: str = ""
     ended: str = ""
@@ -56,7 +56,7 @@ class ScanNote:
 
 class Notes(IndexPart):
     def completeness(self) -> IndexCompleteness | None:
-        """Return the completeness; None while a new index may lack records of the store."""
+        """Return the completeness; None while the index may lack records of the store."""
         value = self._get(_REBUILT)
         return None if value is None else IndexCompleteness(value["at"], value["left_out"], tuple(value["names"]))
 
@@ -69,12 +69,12 @@ class Notes(IndexPart):
         return None if value is None else str(value["id"])
 
     def name_service(self, identity: str, *, instead: bool = False) -> str:
-        """Set the id of the index's service if it is unset or `instead` is true; return the present id."""
+        """Set the id of the service if it is unset or `instead` is true; return the id that applies."""
         with self.database.write_transaction() as connection:
-            known = None if instead else self.service(within=connection)
-            if known is None:
-                self._set(_SERVICE, {"id": identity}, connection)
-        return known or identity
+            if not instead and (known := self.service(within=connection)) is not None:
+                return known
+            self._set(_SERVICE, {"id": identity}, connection)
+        return identity
 
     def set_incomplete(self) -> None:
         with self.database.write_transaction() as connection:
@@ -99,7 +99,7 @@ class Notes(IndexPart):
         self._set(_SCAN, asdict(note))
 
     def pause_scan(self, lasts_s: float, *, begin: bool = False) -> bool:
-        """Pause the integrity scan for `lasts_s` [s]; with `begin`, return False if it is paused already."""
+        """Pause the integrity scan for `lasts_s` [s]; with `begin`, return False if a pause is active."""
         with self.database.write_transaction() as connection:
             if begin and self.is_scan_paused(within=connection):
                 return False
@@ -119,7 +119,7 @@ class Notes(IndexPart):
 
 @dataclass(frozen=True)
 class Damage:
-    """Stored object with damaged or missing content."""
+    """Damage of a stored object, its time of detection, and the shard to which the object belongs."""
 
     key: str
     what: str
@@ -136,7 +136,7 @@ class KnownDamage(IndexPart):
         with self.database.read_transaction() as connection:
             count = int(connection.scalar(select(func.count()).select_from(damage)) or 0)
             rows = connection.execute(query).mappings()
-            return count, [Damage(row["key"], row["what"], row["shard"], row["found"]) for row in rows]
+            return count, [Damage(**row) for row in rows]
 
     def update(self, found: Sequence[Damage], *, intact: Sequence[str] = ()) -> None:
         rows = [{"key": one.key, "what": one.what, "shard": one.shard, "found": timestamp()} for one in found]

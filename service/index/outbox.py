@@ -29,10 +29,9 @@ class DueDelivery:
 
 
 def append_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
-    """Append ends of jobs and datasets to the feed within a transaction.
+    """Append ends of jobs and datasets within a transaction, numbered in ascending order.
 
-    The number of an end is the time in milliseconds, or the last number plus 1 if that is greater. A new index thus
-    continues after the numbers of a lost one. Writers run one at a time, so numbers appear in ascending order.
+    A number is the time [ms], or the last number plus 1 if greater: a new index continues the numbers of a lost one.
     """
     if rows:
         first = max(last_end(connection) + 1, int(time.time() * 1000))
@@ -50,7 +49,7 @@ class Outbox(IndexPart):
         return [EndView(**row) for row in self.database.rows(query)]
 
     def unreported_datasets(self, *, limit: int = 200) -> list[tuple[str, int]]:
-        """Return datasets whose end was not reported after their last event, with their number of events."""
+        """Return datasets without a report of their end since their last event, with their number of events."""
         query = select(datasets.c.name, datasets.c.events).where(
             datasets.c.planned.is_(True), datasets.c.applied >= datasets.c.events, datasets.c.told < datasets.c.events
         )
@@ -63,11 +62,10 @@ class Outbox(IndexPart):
                 append_ends(connection, [row])
 
     def add(self, hook: Webhook, *, seen: int | None = None, within: Connection | None = None) -> None:
-        """Add a webhook; it receives ends after `seen`, by default all future ends."""
+        """Add a webhook; it receives ends after number `seen`, by default all future ends."""
+        row = {name: getattr(hook, name) for name in ("id", "url", "created", "owner", "project")}
         with self.database.write_transaction(within) as connection:
-            last = seen if seen is not None else last_end(connection)
-            row = {name: getattr(hook, name) for name in ("id", "url", "created", "owner", "project")}
-            row |= {"states": list(hook.states), "seen": last}
+            row |= {"states": list(hook.states), "seen": last_end(connection) if seen is None else seen}
             upsert(connection, webhooks, [row], keep=("seen",))
 
     def webhooks(self, *, scope: ProjectScope = EVERYTHING) -> list[WebhookView]:
@@ -84,17 +82,12 @@ class Outbox(IndexPart):
             connection.execute(delete(webhooks).where(webhooks.c.id == webhook))
 
     def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
-        query = (
-            select(deliveries, ends.c.kind, ends.c.subject, ends.c.state.label("ended"))
-            .join(ends, ends.c.seq == deliveries.c.seq)
-            .where(deliveries.c.webhook == webhook)
-            .order_by(deliveries.c.seq.desc())
-            .limit(limit)
-        )
-        return [DeliveryView(**row) for row in self.database.rows(query)]
+        query = select(deliveries, ends.c.kind, ends.c.subject, ends.c.state.label("ended"))
+        query = query.join(ends, ends.c.seq == deliveries.c.seq).where(deliveries.c.webhook == webhook)
+        return [DeliveryView(**row) for row in self.database.rows(query.order_by(deliveries.c.seq.desc()).limit(limit))]
 
     def create_deliveries(self) -> None:
-        """Create deliveries of newly ended jobs and datasets; they fail at once if too many already wait."""
+        """Create deliveries of new ends; those above `MOST_WAITING` of a webhook fail at once."""
         for hook in self.webhooks():
             mine = (ends.c.project == hook.project, ends.c.seq > hook.seen)
             query = select(ends.c.seq, ends.c.state).where(*mine).order_by(ends.c.seq).limit(_AT_ONCE)
@@ -106,31 +99,22 @@ class Outbox(IndexPart):
                 number, rest_until = connection.execute(of_waiting).one()
                 waits = {"state": "waiting", "due": rest_until or 0.0, "detail": ""}
                 missed = {"state": "failed", "due": 0.0, "detail": f"{MOST_WAITING} deliveries wait already"}
+                reported = [row["seq"] for row in found if row["state"] in hook.states]
                 rows = [
-                    {
-                        "webhook": hook.id,
-                        "seq": seq,
-                        "attempts": 0,
-                        **(waits if number + place < MOST_WAITING else missed),
-                    }
-                    for place, seq in enumerate(row["seq"] for row in found if row["state"] in hook.states)
+                    {"webhook": hook.id, "seq": seq, "attempts": 0, **(waits if place < MOST_WAITING else missed)}
+                    for place, seq in enumerate(reported, start=number)
                 ]
                 upsert(connection, deliveries, rows, keep=("state", "attempts", "due", "detail"))
                 connection.execute(update(webhooks).where(webhooks.c.id == hook.id).values(seen=found[-1]["seq"]))
 
     def due_deliveries(self, now: float) -> list[DueDelivery]:
+        """Return the oldest due delivery of each webhook."""
         hooks = {hook.id: hook for hook in self.webhooks()}
-        first = (
-            select(func.min(deliveries.c.seq).label("seq"), deliveries.c.webhook)
-            .where(deliveries.c.state == "waiting", deliveries.c.due <= now)
-            .group_by(deliveries.c.webhook)
-            .subquery()
-        )
-        query = (
-            select(ends, deliveries.c.webhook, deliveries.c.attempts)
-            .join(first, first.c.seq == ends.c.seq)
-            .join(deliveries, (deliveries.c.seq == first.c.seq) & (deliveries.c.webhook == first.c.webhook))
-        )
+        oldest = select(func.min(deliveries.c.seq).label("seq"), deliveries.c.webhook).group_by(deliveries.c.webhook)
+        first = oldest.where(deliveries.c.state == "waiting", deliveries.c.due <= now).subquery()
+        is_first = (deliveries.c.seq == first.c.seq) & (deliveries.c.webhook == first.c.webhook)
+        query = select(ends, deliveries.c.webhook, deliveries.c.attempts)
+        query = query.join(first, first.c.seq == ends.c.seq).join(deliveries, is_first)
         return [
             DueDelivery(hooks[row["webhook"]], EndView(**row), row["attempts"])
             for row in self.database.rows(query)
@@ -140,7 +124,7 @@ class Outbox(IndexPart):
     def record_attempt(
         self, due: DueDelivery, *, status: int | None, detail: str, done: bool, final: bool = False
     ) -> None:
-        """Record an attempt: a failure delays all deliveries of the webhook, or fails them if `final`."""
+        """Record an attempt; a failure delays all waiting deliveries of the webhook, or fails them if `final`."""
         last = final or due.attempts >= len(WAITS_S)
         rest_until = 0.0 if done else time.time() + WAITS_S[min(due.attempts, len(WAITS_S) - 1)]
         values = {

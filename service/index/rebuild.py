@@ -6,7 +6,7 @@ import logging
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -41,20 +41,18 @@ from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
 RecordT = TypeVar("RecordT", bound=Record)
-#: Exceptions for an invalid record, here or in the database; none of them means an unavailable backend.
+#: Errors of an invalid record, when it is read or written to the database. An unavailable backend raises other errors.
 _OF_THE_RECORD: Final = (DamagedError, InputError, DataError, ValueError, TypeError, LookupError, ArithmeticError)
 _READERS: Final = 16
 _SHOWN_DIFFERENCES: Final = 50
-
-
 #: Called with the kind of records and the number read so far.
 Progress = Callable[[str, int], object]
 
 
 def rebuild(index: Index, store: Store, *, progress: Progress = lambda what, number: None) -> dict[str, int]:
-    """Derive all rows anew from the store; return the numbers of records by kind, and of omitted ones.
+    """Replace all rows by rows derived from the store, in one transaction; return record counts by kind.
 
-    The old rows stay until all new ones exist. The log names all damaged records; `index.notes` stores the first 50.
+    `left_out` counts damaged records. The log names all of them, `index.notes` the first 50.
     """
     with index.database.write_transaction() as connection:
         connection.execution_options(**{QUIET: True})
@@ -74,7 +72,7 @@ def rebuild(index: Index, store: Store, *, progress: Progress = lambda what, num
 
 
 class _Rebuild:
-    """One rebuild: each record has its own savepoint, so that an invalid record leaves no rows."""
+    """Rebuild in one transaction, with one savepoint per record: an invalid record leaves no rows."""
 
     def __init__(self, index: Index, store: Store, connection: Connection, progress: Progress) -> None:
         self._index, self._store, self._connection, self._progress = index, store, connection, progress
@@ -93,7 +91,7 @@ class _Rebuild:
                     self._index.write.add_asset(load_asset(self._store, kind, digest), check, within=self._connection)
 
     def add_jobs(self) -> None:
-        """Read jobs, then failed attempts by number, then events."""
+        """Add jobs, then failed attempts by number, then events."""
         known = []
         for key, data in self._read(names.JOBS, lambda key: key.endswith("/job.json") and key.count("/") == 2):
             with self._skip_invalid(key, "jobs"):
@@ -131,12 +129,13 @@ class _Rebuild:
                 self._index.write_dataset.add_object_set(parse_record(ObjectSet, data, key), within=self._connection)
 
     def add_webhooks(self) -> None:
-        for hook in self._parse_records(Webhook, names.WEBHOOKS):
-            with self._skip_invalid(names.webhook_key(hook.id)):
+        for key, data in self._read(names.WEBHOOKS):
+            with self._skip_invalid(key):
+                hook = parse_record(Webhook, data, key)
                 self._index.outbox.add(hook, seen=self._seen.get(hook.id, self._last), within=self._connection)
 
     def add_tags(self) -> None:
-        """Read the last version of each tag; earlier versions remain after interrupted changes."""
+        """Add the last version of each tag; earlier versions remain in the store after interrupted changes."""
         last = {key.rpartition("/")[0]: (key, data) for key, data in sorted(self._read(names.TAGS))}
         for key, data in last.values():
             with self._skip_invalid(key):
@@ -152,10 +151,9 @@ class _Rebuild:
     def _read(
         self, prefix: str, wanted: Callable[[str], bool] = lambda key: key.endswith(".json")
     ) -> Iterator[tuple[str, bytes]]:
-        """Yield keys and bytes of records; records removed since the listing are skipped."""
-        keys = [
-            entry.key for entry in self._store.list(prefix) if wanted(entry.key) and not self._is_deleted(entry.key)
-        ]
+        """Yield key and bytes of each record below a prefix, except those of deleted jobs and datasets."""
+        listed = (entry.key for entry in self._store.list(prefix))
+        keys = [key for key in listed if wanted(key) and not self._is_deleted(key)]
         with ThreadPoolExecutor(_READERS) as pool:
             for key, data in zip(keys, pool.map(self._bytes, keys), strict=True):
                 if data is not None:
@@ -167,10 +165,10 @@ class _Rebuild:
         return (what, rest.partition("/")[0]) in self._gone
 
     def _bytes(self, key: str) -> bytes | None:
-        try:
+        """Return the bytes of a record; None if it was removed since the listing."""
+        with suppress(NotFoundError):
             return self._store.get(key)
-        except NotFoundError:
-            return None
+        return None
 
     @contextmanager
     def _skip_invalid(self, key: str, what: str | None = None) -> Iterator[None]:
@@ -187,14 +185,13 @@ class _Rebuild:
 
 
 def complete_if_new(index: Index, store: Store) -> None:
-    if index.notes.completeness() is None and not any(
-        True for prefix in (names.JOBS, names.DATASETS) for _ in store.list(prefix)
-    ):
+    """Mark an index of unknown completeness as complete if the store has no jobs and no datasets."""
+    if index.notes.completeness() is None and not any(any(store.list(key)) for key in (names.JOBS, names.DATASETS)):
         index.notes.set_complete()
 
 
 def differences(index: Index, store: Store) -> list[str]:
-    """Return at most 50 lines: damaged records, then rows that `rebuild` would change; empty if equal."""
+    """Return at most 50 lines: damaged records, then rows that `rebuild` would change."""
     with (
         tempfile.TemporaryDirectory(prefix="graspd-index-") as folder,
         closing(Index(sqlite_url(Path(folder) / "index.sqlite"))) as fresh,
@@ -208,7 +205,7 @@ def differences(index: Index, store: Store) -> list[str]:
 
 
 def missing_names(index: Index, store: Store) -> list[str]:
-    """List shards and jobs missing in the index or in the store, one line each, without reading records."""
+    """Return one line per shard or job that only the index or only the store has, without reading records."""
     gone = {f"jobs {name}" for what, name in pending_deletions(store) if what == "job"}
     stored = {
         f"shards {entry.key.rpartition('/')[2].removesuffix('.json')}"
@@ -240,14 +237,12 @@ def _compare(table: Table, live: Connection, derived: Connection) -> Iterator[st
 def _rows(table: Table, connection: Connection) -> dict[tuple[Any, ...], dict[str, Any]]:
     keys = [column.name for column in table.primary_key]
     columns = [column for column in table.columns if column.name not in LIVE_COLUMNS]
-    rows = {}
-    for row in connection.execute(select(*columns)).mappings():
-        rows[tuple(row[key] for key in keys)] = _without_run_state(dict(row))
-    return rows
+    rows = connection.execute(select(*columns)).mappings()
+    return {tuple(row[key] for key in keys): _without_run_state(dict(row)) for row in rows}
 
 
 def _without_run_state(row: dict[str, Any]) -> dict[str, Any]:
-    """Remove current state: a running task becomes queued, and a queued or cancelled one has no worker."""
+    """Remove current state: running becomes queued, and a queued or cancelled task has no worker."""
     if row.get("state") == State.RUNNING.value:
         row["state"] = State.QUEUED.value
     if row.get("state") in (State.QUEUED.value, State.CANCELLED.value) and "worker" in row:

@@ -1,7 +1,6 @@
-"""Tables of the index. `LIVE_COLUMNS` are current state (progress, queue marks), others are derived.
+"""Tables of the index, derived from the store except for `LIVE_COLUMNS` and `LIVE_TABLES`.
 
-Each change, except for metrics of grasps, needs another `REVISION` in `database`; a test enforces this. `applied` and
-`planned` of datasets are the progress of the controller; tags are users' names for grasps.
+Each change needs another `REVISION` in `database`, except for new metrics of grasps; a test enforces this.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ from graspd.service.model.metrics import IndexLevel, indexed_metrics
 metadata: Final = MetaData()
 
 
-def required_columns(kind: TypeEngine[Any] | type[TypeEngine[Any]], *names: str) -> list[Column[Any]]:
-    return [Column(name, kind, nullable=False) for name in names]
+def required_columns(**types: TypeEngine[Any] | type[TypeEngine[Any]]) -> list[Column[Any]]:
+    return [Column(name, kind, nullable=False) for name, kind in types.items()]
 
 
 def owner_columns() -> list[Column[Any]]:
@@ -29,18 +28,14 @@ jobs: Final = Table(
     "jobs",
     metadata,
     Column("id", String(32), primary_key=True),
-    Column("state", String(10), nullable=False),
-    Column("priority", String(12), nullable=False),
-    *required_columns(String(64), "hand", "object"),
-    *required_columns(String(32), "hand_digest", "object_digest"),
-    Column("request", JSON, nullable=False),
+    *required_columns(state=String(10), priority=String(12), hand=String(64), object=String(64)),
+    *required_columns(hand_digest=String(32), object_digest=String(32), request=JSON),
     Column("revisions", JSON, nullable=False, server_default='{"synthesize": 1, "scene": 1, "render": 1}'),
     Column("origin", JSON(none_as_null=True)),
     *owner_columns(),
     Column("cancelled", Boolean, nullable=False),
-    # Number of batches per task.
-    Column("span", Integer, nullable=False),
-    Column("created", String(32), nullable=False),
+    # `span` is the number of batches per task.
+    *required_columns(span=Integer, created=String(32)),
     Column("finished", String(32)),
     Column("reason", Text),
     # Digests of the neighbours, separated by spaces; a list would need a table.
@@ -57,17 +52,9 @@ tasks: Final = Table(
     "tasks",
     metadata,
     Column("id", String(32), primary_key=True),
-    Column("job_id", String(32), nullable=False),
-    Column("stage", String(12), nullable=False),
-    *required_columns(Integer, "batch", "position", "count"),
-    Column("priority", String(12), nullable=False),
-    Column("inputs", JSON, nullable=False),
-    Column("shard_id", String(32), nullable=False),
-    Column("state", String(10), nullable=False),
-    *required_columns(Boolean, "ready", "done"),
-    Column("last_attempt", Integer, nullable=False),
-    Column("exhausted", Boolean, nullable=False),
-    Column("retried_upto", Integer, nullable=False),
+    *required_columns(job_id=String(32), stage=String(12), batch=Integer, position=Integer, count=Integer),
+    *required_columns(priority=String(12), inputs=JSON, shard_id=String(32), state=String(10), ready=Boolean),
+    *required_columns(done=Boolean, last_attempt=Integer, exhausted=Boolean, retried_upto=Integer),
     Column("reason", Text),
     Column("worker", String(128)),
     Column("device", String(64)),
@@ -91,15 +78,11 @@ attempts: Final = Table(
     metadata,
     Column("task_id", String(32), primary_key=True),
     Column("number", Integer, primary_key=True),
-    Column("job_id", String(32), nullable=False),
-    Column("stage", String(12), nullable=False),
-    Column("kind", String(64), nullable=False),
-    Column("reason", Text, nullable=False),
+    *required_columns(job_id=String(32), stage=String(12), kind=String(64), reason=Text),
     Column("trace", Text),
     Column("worker", String(128), nullable=False),
     Column("started", String(32)),
-    Column("ended", String(32), nullable=False),
-    Column("last", Boolean, nullable=False),
+    *required_columns(ended=String(32), last=Boolean),
     Index("attempts_of_job", "job_id", "ended"),
     Index("attempts_by_kind", "stage", "kind"),
 )
@@ -107,27 +90,17 @@ shards: Final = Table(
     "shards",
     metadata,
     Column("id", String(32), primary_key=True),
-    Column("kind", String(8), nullable=False),
-    Column("stage", String(12), nullable=False),
-    Column("key", String(128), nullable=False),
-    Column("sha256", String(64), nullable=False),
-    Column("size_bytes", BigInteger, nullable=False),
-    *required_columns(Integer, "count", "valid"),
+    *required_columns(kind=String(8), stage=String(12), key=String(128), sha256=String(64)),
+    *required_columns(size_bytes=BigInteger, count=Integer, valid=Integer),
     Column("candidates", Integer, nullable=False, server_default="0"),
     Column("rechecked", Integer, nullable=False, server_default="0"),
     Column("recheck_held", Integer, nullable=False, server_default="0"),
     Column("validated", Integer, nullable=False, server_default="0"),
-    *required_columns(String(64), "hand", "object"),
-    *required_columns(String(32), "hand_digest", "object_digest"),
+    *required_columns(hand=String(64), object=String(64), hand_digest=String(32), object_digest=String(32)),
     Column("batch", Integer, nullable=False),
     Column("batches", Integer, nullable=False, server_default="1"),
-    Column("seed", Integer, nullable=False),
-    Column("inputs", JSON, nullable=False),
-    Column("device", String(64), nullable=False),
-    Column("worker", String(128), nullable=False),
-    Column("seconds", Float, nullable=False),
-    Column("created", String(32), nullable=False),
-    Column("manifest", JSON, nullable=False),
+    *required_columns(seed=Integer, inputs=JSON, device=String(64), worker=String(128), seconds=Float),
+    *required_columns(created=String(32), manifest=JSON),
     Column("charged", String(32), nullable=False, server_default=""),
     Index("shards_newest", "created", "id"),
     Index("shards_by_kind", "kind", "created", "id"),
@@ -144,7 +117,7 @@ grasps: Final = Table(
     metadata,
     Column("shard_id", String(32), primary_key=True),
     Column("row", Integer, primary_key=True),
-    *required_columns(String(64), "hand", "object"),
+    *required_columns(hand=String(64), object=String(64)),
     *(Column(metric.name, Integer if metric.whole else Float) for metric in indexed_metrics()),
     Column("valid", Boolean, nullable=False),
     Column("success", Boolean),
@@ -165,18 +138,13 @@ assets: Final = Table(
     metadata,
     Column("kind", String(8), primary_key=True),
     Column("digest", String(32), primary_key=True),
-    Column("name", String(64), nullable=False),
-    Column("filename", Text, nullable=False),
-    Column("files", JSON, nullable=False),
-    Column("size_bytes", Integer, nullable=False),
-    Column("created", String(32), nullable=False),
+    *required_columns(name=String(64), filename=Text, files=JSON, size_bytes=Integer, created=String(32)),
     Column("builtin", Boolean, nullable=False),
     *owner_columns(),
     Column("shared", Boolean, nullable=False, server_default=false()),
     Column("verdict", String(8)),
     Column("message", Text),
-    *required_columns(JSON, "repairs", "facts"),
-    Column("last_attempt", Integer, nullable=False),
+    *required_columns(repairs=JSON, facts=JSON, last_attempt=Integer),
     Column("queued", Boolean, nullable=False, default=False),
     Column("not_before", Float, nullable=False, default=0.0),
     Index("assets_by_name", "kind", "name", "created"),
@@ -185,15 +153,10 @@ workers: Final = Table(
     "workers",
     metadata,
     Column("name", String(128), primary_key=True),
-    Column("host", String(128), nullable=False),
-    Column("pid", Integer, nullable=False),
-    Column("device", String(64), nullable=False),
-    Column("device_name", String(128), nullable=False),
-    Column("stages", JSON, nullable=False),
-    Column("version", String(32), nullable=False),
-    Column("state", String(16), nullable=False),
+    *required_columns(host=String(128), pid=Integer, device=String(64), device_name=String(128), stages=JSON),
+    *required_columns(version=String(32), state=String(16)),
     Column("task_id", String(32)),
-    *required_columns(String(32), "started", "seen"),
+    *required_columns(started=String(32), seen=String(32)),
     Column("reason", String(300), nullable=False, server_default=""),
 )
 #: Costs of deleted shards by project, day and device, because deleted results count as usage.
@@ -203,8 +166,7 @@ spent: Final = Table(
     Column("project", String(32), primary_key=True),
     Column("day", String(10), primary_key=True),
     Column("device", String(64), primary_key=True),
-    *required_columns(BigInteger, "grasps", "valid", "tasks"),
-    Column("seconds", Float, nullable=False),
+    *required_columns(grasps=BigInteger, valid=BigInteger, tasks=BigInteger, seconds=Float),
 )
 notes: Final = Table(
     "notes", metadata, Column("name", String(64), primary_key=True), Column("value", JSON, nullable=False)
@@ -213,25 +175,20 @@ damage: Final = Table(
     "damage",
     metadata,
     Column("key", String(512), primary_key=True),
-    Column("what", Text, nullable=False),
-    Column("shard", String(64), nullable=False),
-    Column("found", String(32), nullable=False),
+    *required_columns(what=Text, shard=String(64), found=String(32)),
 )
 _PROGRESS: Final = ("progress_done", "progress_total", "progress_message")
-#: Columns and tables of current state, which do not follow from the store; a rebuild keeps the tables.
+#: Columns and tables of current state, which the store does not contain; a rebuild keeps the tables.
 LIVE_COLUMNS: Final = frozenset({"queued", "not_before", "applied", "planned", "charged", "told", "seen", *_PROGRESS})
 LIVE_TABLES: Final = frozenset({"workers", "notes", "damage", "spent", "ends", "deliveries"})
 datasets: Final = Table(
     "datasets",
     metadata,
     Column("name", String(64), primary_key=True),
-    Column("digest", String(32), nullable=False),
-    *required_columns(JSON, "hands", "objects", "options", "revisions"),
-    Column("cells", Integer, nullable=False),
+    *required_columns(digest=String(32), hands=JSON, objects=JSON, options=JSON, revisions=JSON, cells=Integer),
     Column("created", String(32), nullable=False),
     *owner_columns(),
-    Column("cancelled", Boolean, nullable=False),
-    Column("events", Integer, nullable=False),
+    *required_columns(cancelled=Boolean, events=Integer),
     Column("applied", Integer, nullable=False, default=0),
     Column("planned", Boolean, nullable=False, default=False),
     # Number of events at the last reported end; -1 before the first report.
@@ -245,8 +202,8 @@ dataset_cells: Final = Table(
     metadata,
     Column("dataset", String(64), primary_key=True),
     Column("position", Integer, primary_key=True),
-    *required_columns(String(64), "hand", "object"),
-    *required_columns(String(32), "hand_digest", "object_digest", "job_id"),
+    *required_columns(hand=String(64), object=String(64), hand_digest=String(32), object_digest=String(32)),
+    Column("job_id", String(32), nullable=False),
     Column("fidelity", String(64), nullable=True),
     Column("choice", JSON(none_as_null=True)),
     Index("dataset_cells_by_job", "job_id"),
@@ -256,9 +213,7 @@ dataset_snapshots: Final = Table(
     metadata,
     Column("dataset", String(64), primary_key=True),
     Column("digest", String(32), primary_key=True),
-    Column("created", String(32), nullable=False),
-    Column("complete", Boolean, nullable=False),
-    *required_columns(Integer, "shards", "grasps", "valid"),
+    *required_columns(created=String(32), complete=Boolean, shards=Integer, grasps=Integer, valid=Integer),
     Column("size_bytes", BigInteger, nullable=False),
 )
 object_sets: Final = Table(
@@ -266,16 +221,14 @@ object_sets: Final = Table(
     metadata,
     Column("name", String(64), primary_key=True),
     Column("digest", String(32), primary_key=True),
-    Column("objects", JSON, nullable=False),
-    Column("created", String(32), nullable=False),
+    *required_columns(objects=JSON, created=String(32)),
     Column("project", String(32), nullable=False, server_default=""),
 )
 tags: Final = Table(
     "tags",
     metadata,
     Column("id", String(32), primary_key=True),
-    Column("name", String(64), nullable=False),
-    *required_columns(String(32), "created", "changed"),
+    *required_columns(name=String(64), created=String(32), changed=String(32)),
     *owner_columns(),
     Index("tags_by_name", "name", "project"),
 )
@@ -293,10 +246,7 @@ ends: Final = Table(
     "ends",
     metadata,
     Column("seq", BigInteger, primary_key=True, autoincrement=False),
-    Column("kind", String(8), nullable=False),
-    Column("subject", String(64), nullable=False),
-    Column("state", String(10), nullable=False),
-    Column("at", String(32), nullable=False),
+    *required_columns(kind=String(8), subject=String(64), state=String(10), at=String(32)),
     Column("project", String(32), nullable=False, server_default=""),
     Column("owner", String(64), nullable=False, server_default=""),
     Index("ends_of_project", "project", "seq"),
@@ -305,11 +255,9 @@ webhooks: Final = Table(
     "webhooks",
     metadata,
     Column("id", String(32), primary_key=True),
-    Column("url", Text, nullable=False),
-    Column("states", JSON, nullable=False),
-    Column("created", String(32), nullable=False),
+    *required_columns(url=Text, states=JSON, created=String(32)),
     *owner_columns(),
-    # Current state: ends up to this number have deliveries.
+    # Deliveries exist for ends up to this number.
     Column("seen", BigInteger, nullable=False, server_default="0"),
 )
 deliveries: Final = Table(
@@ -317,9 +265,7 @@ deliveries: Final = Table(
     metadata,
     Column("webhook", String(32), primary_key=True),
     Column("seq", BigInteger, primary_key=True, autoincrement=False),
-    Column("state", String(10), nullable=False),
-    Column("attempts", Integer, nullable=False),
-    Column("due", Float, nullable=False),
+    *required_columns(state=String(10), attempts=Integer, due=Float),
     Column("tried", String(32)),
     Column("status", Integer),
     Column("detail", String(300), nullable=False, server_default=""),

@@ -16,13 +16,13 @@ from graspd.service.model.records import Grasp, Tag
 
 class Tags(IndexPart):
     def all(self, *, scope: ProjectScope = EVERYTHING) -> list[TagView]:
-        there = (grasps.c.shard_id == tagged.c.shard_id) & (grasps.c.row == tagged.c.row)
-        number = select(func.count()).select_from(tagged.join(grasps, there)).where(tagged.c.tag == tags.c.id)
+        existing = (grasps.c.shard_id == tagged.c.shard_id) & (grasps.c.row == tagged.c.row)
+        number = select(func.count()).select_from(tagged.join(grasps, existing)).where(tagged.c.tag == tags.c.id)
         query = select(tags, number.scalar_subquery().label("grasps")).where(*scope_conditions(scope, tags))
         return [TagView(**row) for row in self.database.rows(query.order_by(tags.c.name, tags.c.project))]
 
     def id_of(self, name: str, *, scope: ProjectScope = EVERYTHING) -> str:
-        """Return the id of a tag by name or id, own tags first; NotFoundError if none is in scope."""
+        """Return the id of a tag by id or name, own tags first; NotFoundError if no such tag is in scope."""
         own_first = case((tags.c.id == name, 0), (tags.c.project == scope.project, 1), else_=2)
         query = select(tags.c.id).where((tags.c.name == name) | (tags.c.id == name), *scope_conditions(scope, tags))
         found = self.database.value(query.order_by(own_first, tags.c.project).limit(1))

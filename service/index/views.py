@@ -1,4 +1,4 @@
-"""Results of queries of the index: frozen records, ready for JSON. Times are RFC 3339 in UTC."""
+"""Results of index queries: frozen models, ready for JSON. Times are RFC 3339 in UTC."""
 
 from __future__ import annotations
 
@@ -20,23 +20,21 @@ class View(BaseModel):
 
 
 class Page(View, Generic[T]):
-    """Part of a list. `next` is the cursor of the next part, None at the end."""
+    """Page of a list. `next` is the cursor of the next page, None at the end."""
 
     items: list[T]
     next: str | None = None
 
 
 class Validated(View):
-    """Numbers of grasps and of valid grasps. The yield omits grasps without validation."""
+    """Numbers of grasps and of candidates. The yield omits grasps without validation."""
 
     grasps: int = Field(0, description="grasps stored so far")
     valid: int = Field(
-        0, description="valid grasps: within the geometric limits and held in validation; 0 without validation"
+        0, description="grasps within the geometric limits that held in validation; 0 without validation"
     )
     candidates: int = Field(0, description="candidates planned for these grasps, stored or not")
-    validated: int = Field(
-        0, description="candidates tested against the geometric limits and by a validator; 0 without validation"
-    )
+    validated: int = Field(0, description="candidates tested for geometric limits and validated; 0 without validation")
 
     @computed_field(description="valid grasps per validated candidate; null: not validated")  # type: ignore[prop-decorator]
     @property
@@ -45,7 +43,7 @@ class Validated(View):
 
 
 class StageProgress(View):
-    """Tasks of one stage of a job, by state. `done` counts finished tasks plus shares of running ones."""
+    """Tasks of one stage of a job, by state. `done` counts finished tasks and shares of running ones."""
 
     stage: Stage
     tasks: int
@@ -70,7 +68,7 @@ class JobView(Validated):
     owner: str = Field("", description="id of the key that submitted it; empty: none or unknown")
     project: str = Field("", description="its project; empty: the unnamed project")
     finished: str | None
-    choice: Choice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
+    choice: Choice | None = Field(None, description="how a chart replaced the fidelity auto, if requested")
     reason: str | None = Field(None, description="why the job failed: error of its first failed task")
     stages: list[StageProgress] = []
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
@@ -145,14 +143,14 @@ class ShardView(View):
 
 @insert_fields(valid=value_fields(optional=False), created=value_fields(optional=True))
 class GraspView(View):
-    """One grasp with its indexed quality; contact metrics at the manifest's contact threshold (5 mm)."""
+    """Grasp with its indexed metrics; contact metrics apply to the manifest's contact threshold (5 mm)."""
 
     shard_id: str
     row: int
     hand: str
     object: str
     valid: bool
-    success: bool | None = Field(description="verdict of the validator; None: not tested")
+    success: bool | None = Field(description="whether it held in validation; None: not validated")
     verdict_level: str | None = Field(description="level of validation of that verdict")
     scene_kind: str = Field("free", description="kind of scene in which it was planned; free: around a floating object")
     neighbours: int = Field(0, description="number of neighbours in that scene")
@@ -239,9 +237,7 @@ class WebhookView(View):
     created: str
     owner: str = Field("", description="id of the key that created it")
     project: str = Field("", description="project whose jobs and datasets it reports")
-    seen: int = Field(
-        0, description="sequence number of the last ended job or dataset for which deliveries were created"
-    )
+    seen: int = Field(0, description="sequence number of the last ended job or dataset with created deliveries")
 
 
 class TagView(View):
@@ -271,7 +267,7 @@ class DeliveryView(View):
 
 
 class UsageDay(View):
-    """Daily usage of a project: tasks ended that day, counted for the project that first requested them."""
+    """Daily usage of a project: tasks that ended on that day and that this project requested first."""
 
     project: str = Field(description="empty: the unnamed project")
     day: str = Field(description="UTC day, from midnight to midnight")
@@ -283,7 +279,7 @@ class UsageDay(View):
 
 
 class MatrixCell(Validated):
-    """One hand on one object of the matrix."""
+    """Totals of the jobs of one hand on one object."""
 
     hand: str
     object: str
@@ -325,10 +321,8 @@ class DatasetView(Validated):
     def reason(self) -> str | None:
         if not self.state.is_final or self.options.want != "valid":
             return None
-        options = self.options
-        return explain_shortfall(
-            self.counted, self.asked, options.counted, self.candidates, options.budget, self.outcomes
-        )
+        options, found = self.options, self.counted
+        return explain_shortfall(found, self.asked, options.counted, self.candidates, options.budget, self.outcomes)
 
     @property
     def counted(self) -> int:

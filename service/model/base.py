@@ -1,4 +1,4 @@
-"""Common parts of the domain models: base class, patterns of names, messages for validation errors."""
+"""Base class of the domain models, patterns of names, and texts of validation errors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TagName = Annotated[
 ]
 DIGEST: Final = r"^[0-9a-f]{32}$"
 Digest = Annotated[str, Field(pattern=DIGEST)]
-#: An id or an empty text. Any client can write to Redis, so this pattern bounds values from there.
+#: An id or an empty text. Any client can write to Redis, so this pattern limits values from Redis.
 Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,64}$")]
 
 _WORDS: Final = {
@@ -57,17 +57,20 @@ _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')"
 def first_error(
     error: ValidationError, model: type[BaseModel] | None = None, names: Mapping[str, str] | None = None
 ) -> str:
-    """Return the first error with its place: `scene.touch: must be at least -1`; `model` adds all bounds."""
+    """Return the text of the first error, such as `scene.touch: must be at least -1`.
+
+    `model` adds all bounds of the field; `names` maps fields to names for the user.
+    """
     first = error.errors(include_url=False)[0]
     # For a union of models, pydantic adds the name of the tested model.
     place = [str(part) for part in first["loc"] if not _CLASS.match(str(part))]
     if place and names:
-        named = names.get(place[0], place[0])
-        place = [named] if named.startswith("-") else [named, *place[1:]]
+        name = names.get(place[0], place[0])
+        place = [name] if name.startswith("-") else [name, *place[1:]]
     field = model.model_fields.get(str(first["loc"][0])) if model and len(first["loc"]) == 1 else None
-    bounded = field is not None and first["type"] in _BOUNDS
-    said = f"{range_text(bounds_of(field))}; got {first['input']!r}" if field and bounded else problem_text(first)
-    return f"{'.'.join(place)}: {said}" if place else said
+    is_bounded = field and first["type"] in _BOUNDS
+    text = f"{range_text(bounds_of(field))}; got {first['input']!r}" if field and is_bounded else problem_text(first)
+    return f"{'.'.join(place)}: {text}" if place else text
 
 
 def bounds_of(field: FieldInfo) -> dict[str, float]:
@@ -84,8 +87,8 @@ def _metadata(annotation: object) -> list[object]:
 
 
 def range_text(bounds: Mapping[str, float]) -> str:
-    said = [_WORDS[name].format(**{key: f"{bounds[key]:.12g}"}) for name, key in _BOUNDS.items() if key in bounds]
-    return " and ".join([*said[:1], *(words.removeprefix("must be ") for words in said[1:])])
+    texts = [_WORDS[name].format(**{key: f"{bounds[key]:.12g}"}) for name, key in _BOUNDS.items() if key in bounds]
+    return " and ".join([*texts[:1], *(text.removeprefix("must be ") for text in texts[1:])])
 
 
 def problem_text(entry: Mapping[str, Any]) -> str:
@@ -99,23 +102,23 @@ def problem_text(entry: Mapping[str, Any]) -> str:
         known = re.findall(r"'([^']*)'", expected)
         word = choices["word"] if choices else entry.get("input")
         return f"must be one of {choices_text(str(word), known)}" if known else message
-    said = _WORDS.get(entry["type"])
+    template = _WORDS.get(entry["type"])
     bounds = {name: f"{value:g}" if isinstance(value, float) else value for name, value in facts.items()}
-    return said.format(**bounds) if said else message
+    return template.format(**bounds) if template else message
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of a library's message; a dump of internals may follow."""
+    """Return the first line of a library's error message, or the name of the error."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def error_text(error: Exception) -> str:
-    """Return a library's message about a file; for a system error, its text without number and path."""
+    """Return a library's error message; for a system error, without its number and path."""
     return getattr(error, "strerror", None) or str(error)
 
 
 def json_value(value: Any) -> Any:
-    """Return a nested value for JSON, with None for nan and infinity."""
+    """Return a nested value for JSON: None replaces nan and infinity."""
     if isinstance(value, dict):
         return {str(key): json_value(part) for key, part in value.items()}
     if isinstance(value, list | tuple):

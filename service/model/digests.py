@@ -1,4 +1,4 @@
-"""Content addresses: digests of a result's inputs, so that repeated runs of a task write one shard."""
+"""Digests of inputs as ids of files, jobs and shards; repeated runs of a task write one shard."""
 
 from __future__ import annotations
 
@@ -29,11 +29,9 @@ def digest_json(value: object) -> str:
 
 
 def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
-    if hasattr(files, "digest"):  # Archive on disk (`service.store.assets.ZipFiles`).
-        digests = {name: files.digest(name) for name in files}
-    else:
-        digests = {name: digest_bytes(data) for name, data in files.items()}
-    return digest_json({"kind": kind, "files": digests})
+    # `service.store.assets.ZipFiles`, an archive on disk, knows the digests.
+    digest = getattr(files, "digest", lambda name: digest_bytes(files[name]))
+    return digest_json({"kind": kind, "files": {name: digest(name) for name in files}})
 
 
 def digest_variant(digest: str, options: Mapping[str, object] | None) -> str:
@@ -52,7 +50,7 @@ def shard_id(
     revision: int,
     inputs: Iterable[str] = (),
 ) -> str:
-    """Return the id of the shard that a stage makes; only inputs that affect the result count."""
+    """Return the id of the shard that a stage makes: the digest of all inputs that affect the result."""
     inputs_of: dict[str, object] = {
         "stage": stage,
         "revision": revision,
@@ -87,7 +85,7 @@ def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
     found: dict[str, object] = {}
     if request.want == "valid":
         found |= {"want": request.want, "budget": request.budget}
-        # Digests omit the default distance; a new default requires a new revision of the stage.
+        # Digests omit the default distance, so a new default needs a new revision of the stage.
         found |= {} if request.min_distance == MIN_DISTANCE_M else {"min_distance": request.min_distance}
     if request.validation != "none":
         rechecks = sum(map(request.rechecks_of, batches))
@@ -103,6 +101,6 @@ def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
 
 def job_id(request: JobRequest, hand_digest: str, object_digest: str, project: str = "") -> str:
     """Return the id of a job: equal requests for the same hand, object and project are one job."""
-    wanted = original_request(request.model_dump(mode="json"))
-    said = {"request": wanted, "hand": hand_digest, "object": object_digest, "revisions": STAGE_REVISIONS}
-    return digest_json(said | ({"project": project} if project else {}))
+    original = original_request(request.model_dump(mode="json"))
+    inputs = {"request": original, "hand": hand_digest, "object": object_digest, "revisions": STAGE_REVISIONS}
+    return digest_json(inputs | ({"project": project} if project else {}))

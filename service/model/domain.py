@@ -52,16 +52,16 @@ NETWORK_METHODS: Final = ("learned",)
 METHODS: Final = ("fast_graspd", "graspit", "graspd2022", "dfc", *NETWORK_METHODS, "autograsp")
 #: Default number of scenes of a batch planned in scenes.
 SCENES: Final = 4
-_REFEREES_IN_WORDS: Final = {
+_LEVEL_LABELS: Final = {
     "standard": "standard",
     "fast": "fast screening",
     "dexgraspbench": "DexGraspBench protocol, slower",
     "none": "no validation",
 }
-_FACES_IN_WORDS: Final = {"drawn": "as dropped", "all": "every stable face"}
-_WANTS_IN_WORDS: Final = {"valid": "valid grasps", "candidates": "all candidates"}
-_TYPES_IN_WORDS: Final = {name: name.replace("_", " ") for name in get_args(GraspTypeName)}
-_SCENES_IN_WORDS: Final = {"free": "free object", "table": "table", "bin": "bin", "shelf": "shelf"}
+_FACE_LABELS: Final = {"drawn": "as dropped", "all": "every stable face"}
+_WANT_LABELS: Final = {"valid": "valid grasps", "candidates": "all candidates"}
+_SCENE_LABELS: Final = {"free": "free object", "table": "table", "bin": "bin", "shelf": "shelf"}
+_TYPE_LABELS: Final = {name: name.replace("_", " ") for name in get_args(GraspTypeName)}
 SHAKE_NEEDS_A_SCENE: Final = "shake needs a lift out of a scene: choose a scene, such as table"
 
 
@@ -71,7 +71,7 @@ Cone = Annotated[str, Field(max_length=80), AfterValidator(lambda text: text and
 
 
 def _sparse(default: Any, **facts: Any) -> Any:
-    """Return a field that JSON omits at its default: ids and records of jobs without it are unchanged."""
+    """Return a field that JSON omits at its default: new fields change no ids and records of old jobs."""
     return Field(default, exclude_if=lambda value: value == default, **facts)
 
 
@@ -96,37 +96,27 @@ class JobOptions(Model):
     scene: Annotated[
         SceneOption,
         Option("basic", typed="scene of the grasps: free, table, bin, shelf, or a JSON or YAML file"),
-        Form("scenes", "Scene", choices=_SCENES_IN_WORDS, cells=True),
+        Form("scenes", "Scene", choices=_SCENE_LABELS, cells=True),
     ] = _sparse(
         "free",
-        description="scene of the grasps: free (a floating object), table, bin, shelf, or JSON with "
-        "supports. Grasps of a scene other than free are planned, validated, rendered and counted "
-        "there",
+        description="scene in which grasps are planned, validated, rendered and counted: free (a floating object), "
+        "table, bin, shelf, or JSON with supports",
     )
     faces: Annotated[
-        Literal["drawn", "all"], Option(), Form("scenes", "Resting face", choices=_FACES_IN_WORDS, cells=True)
+        Literal["drawn", "all"], Option(), Form("scenes", "Resting face", choices=_FACE_LABELS, cells=True)
     ] = _sparse(
         "drawn",
-        description="resting faces of the object in its scenes. drawn: each as often as after drops; all: one scene "
-        "for each stable face, regardless of `scenes`",
+        description="resting faces of the object. drawn: with their frequency after drops; all: one scene for each "
+        "stable face, regardless of `scenes`",
     )
     neighbours: Annotated[
         tuple[BesideOption, ...],
-        Option(
-            "basic", flags="--with", typed="neighbour in each scene: a name, or for graspd submit a mesh; up to eight"
-        ),
-        Form(
-            "scenes",
-            "Neighbours",
-            "names of up to eight objects, separated by commas",
-            placeholder="block, bottle",
-            cells=True,
-        ),
+        Option("basic", flags="--with", typed="neighbour in each scene: a name, or for graspd submit a mesh; up to 8"),
+        Form("scenes", "Neighbours", "names of up to 8 objects", placeholder="block, bottle", cells=True),
     ] = _sparse(
         (),
         max_length=MOST_NEIGHBOURS,
-        description="names of up to eight neighbours, dropped around the object in its scenes; a scene with "
-        "supports places its own",
+        description="names of up to eight neighbours, dropped around the object; a scene with supports places its own",
     )
     touch: Annotated[
         Touch,
@@ -134,8 +124,8 @@ class JobOptions(Model):
         Form("scenes", "Fingertip clearance", "to supports; 0: contact allowed, 2: as for the hand", cells=True),
     ] = _sparse(
         TOUCH,
-        description="clearance of fingertips to the supports of their scene [mm]. 2: as for the rest of the hand; 0: "
-        "contact allowed; negative: fingertips may press into the support, for flat objects",
+        description="clearance of fingertips to supports [mm]. 2: as for the rest of the hand; 0: contact allowed; "
+        "negative: fingertips may press into the support, for flat objects",
     )
     scenes: Annotated[
         int, Option("basic"), Form("scenes", "Scenes", "per batch; 0: none if the scene is free, else 4")
@@ -156,7 +146,7 @@ class JobOptions(Model):
         (), description="image channels besides colour, depth and segmentation: distance, normals or occlusion"
     )
     type: Annotated[
-        GraspTypeName, Option("basic", schema=7), Form("grasps", "Grasp type", choices=_TYPES_IN_WORDS, cells=True)
+        GraspTypeName, Option("basic", schema=7), Form("grasps", "Grasp type", choices=_TYPE_LABELS, cells=True)
     ] = _sparse(
         "any",
         description="type of the grasps by contact: power, precision, pinch, lateral, or a type of the GRASP taxonomy. "
@@ -201,10 +191,9 @@ class JobOptions(Model):
         None, description=f"Coulomb coefficient of contacts in simulation; default: the object's own, else {FRICTION:g}"
     )
     want: Annotated[
-        Literal["valid", "candidates"], Option("basic"), Form("grasps", "Counted grasps", choices=_WANTS_IN_WORDS)
+        Literal["valid", "candidates"], Option("basic"), Form("grasps", "Counted grasps", choices=_WANT_LABELS)
     ] = Field(
-        "valid",
-        description="grasps that count. valid: valid ones, or without validation feasible ones; candidates: all",
+        "valid", description="grasps that count. valid: valid grasps (without validation: feasible); candidates: all"
     )
     budget: Annotated[float, Option()] = Field(
         4.0, ge=1, le=100, description="maximum number of candidates per requested valid grasp"
@@ -216,17 +205,16 @@ class JobOptions(Model):
         ge=0,
         le=0.1,
         allow_inf_nan=False,
-        description="least distance to earlier grasps of the batch [m]: mean over corresponding points of the "
-        "hand, in the object's frame. Nearer grasps are rejected; 0: no limit. Only with want valid",
+        description="least distance to earlier grasps of the batch [m]: mean over corresponding points of the hand, in "
+        "the object's frame. With want valid, nearer grasps are rejected; 0: no limit",
     )
     validation: Annotated[
         Literal["dexgraspbench", "standard", "fast", "none"],
         Option("basic"),
-        Form("grasps", "Validation in MuJoCo", choices=_REFEREES_IN_WORDS),
+        Form("grasps", "Validation in MuJoCo", choices=_LEVEL_LABELS),
     ] = Field(
         "standard",
-        description="level of validation in MuJoCo. fast: MuJoCo Warp on a GPU decides clear cases; none: "
-        "no grasp counts as valid",
+        description="level of validation in MuJoCo. fast: MuJoCo Warp on a GPU decides clear cases; none: no verdicts",
     )
     rechecks: Annotated[int, Option(places=JOB)] = Field(
         RECHECKS,
@@ -238,9 +226,7 @@ class JobOptions(Model):
     robust: Annotated[
         float,
         Option("basic"),
-        Form(
-            "grasps", "Robust share", "of 8 perturbed models in which a grasp must hold; 0: no requirement", cells=True
-        ),
+        Form("grasps", "Robust share", "of 8 perturbed models in which a grasp must hold; 0: none", cells=True),
     ] = _sparse(
         0.0,
         ge=0,
@@ -253,12 +239,9 @@ class JobOptions(Model):
         0,
         ge=0,
         le=MOST_ROBUST_MODELS,
-        description=f"number of perturbed models in which each valid grasp is validated; 0: {ROBUST_MODELS} if "
-        "`robust` is given, else none",
+        description=f"number of perturbed models per valid grasp; 0: {ROBUST_MODELS} if `robust` is given, else none",
     )
-    payload: Annotated[bool, Option(schema=5)] = _sparse(
-        False, description="measure the heaviest mass that each valid grasp lifts"
-    )
+    payload: Annotated[bool, Option(schema=5)] = _sparse(False, description="measure the payload of each valid grasp")
     min_payload: Annotated[
         float,
         Option(schema=5),
@@ -268,7 +251,7 @@ class JobOptions(Model):
         ge=0,
         le=MOST_KG,
         allow_inf_nan=False,
-        description="mass that a grasp must lift to count [kg]; 0: no requirement. Any other value implies `payload`",
+        description="mass that a grasp must lift to count [kg], which implies `payload`; 0: no requirement",
     )
     shake: Annotated[bool, Option(schema=5), Form("scenes", "After the lift", "Shake: 2 cm, 3 Hz", cells=True)] = (
         _sparse(False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y of its scene")
@@ -281,17 +264,12 @@ class JobOptions(Model):
             | Annotated[str, Field(max_length=80)],
         ],
         Option(flags="--option", typed="option of the planner, such as steps=20000"),
-    ] = Field(
-        default_factory=dict,
-        max_length=16,
-        description="options of the planner, such as steps; see docs/how-to/planners.md",
-    )
+    ] = Field(default_factory=dict, max_length=16, description="options of the planner; see docs/how-to/planners.md")
     target: Annotated[str, Option(places=JOB)] = Field(
         "",
         max_length=40,
-        description="required accuracy for fidelity `auto`, such as gsr>=0.6, dexgraspbench>=0.9 or pd_mm<=1; in a "
-        "scene lift>=0.9, lift_hard or robust. The job uses the cheapest fidelity that meets the target in "
-        "the published chart of free grasps or of the scene",
+        description="required accuracy, for which fidelity `auto` selects the cheapest one in the published chart: "
+        "gsr>=0.6, dexgraspbench>=0.9, pd_mm<=1; in a scene lift>=0.9, lift_hard or robust",
     )
 
     @field_validator("fidelity")
@@ -304,7 +282,7 @@ class JobOptions(Model):
     @field_validator("channels")
     @classmethod
     def _sort_channels(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        # Sorted, because another order of channels must give the same job.
+        # The order of channels must not change the id of the job.
         return tuple(name for name in EXTRA_CHANNELS if name in value)
 
     @model_validator(mode="before")
@@ -325,8 +303,8 @@ class JobOptions(Model):
             raise ValueError("mass and density exclude each other: give one")
         if self.validation == "dexgraspbench" and self.object_properties:
             raise ValueError(
-                f"validation dexgraspbench gives all objects {MASS_KG:g} kg and friction "
-                f"{FRICTION:g}: {', '.join(self.object_properties)} requires standard, fast or none"
+                f"validation dexgraspbench gives all objects {MASS_KG:g} kg and friction {FRICTION:g}: "
+                f"{', '.join(self.object_properties)} requires standard, fast or none"
             )
         self._check_scene()
         if self.views and not self.scenes:
@@ -345,10 +323,7 @@ class JobOptions(Model):
         if self.method in NETWORK_METHODS and not self.network:
             raise ValueError(f"method {self.method} needs the option network: the name of a network in the service")
         if self.method in NETWORK_METHODS and not has_table(self.place):
-            raise ValueError(
-                f"method {self.method} proposes grasps of objects on a table: choose scene table or bin, or supports "
-                "with a level half-space"
-            )
+            raise ValueError(f"method {self.method} is for objects on a table: choose table, bin or a half-space")
 
     def _check_without_validation(self) -> None:
         if self.models:
@@ -379,7 +354,7 @@ class JobOptions(Model):
 
     @property
     def _named_neighbours(self) -> tuple[NamedNeighbour, ...]:
-        # The field's validation has converted names to `NamedNeighbour`.
+        # Validation of the field has converted names to `NamedNeighbour`.
         return tuple(one for one in self.neighbours if isinstance(one, NamedNeighbour))
 
     @property
@@ -412,16 +387,16 @@ class JobOptions(Model):
 
     @property
     def counted(self) -> Literal["valid", "feasible"]:
-        """Grasps that count towards the wanted number: valid, or without validation feasible."""
+        """Status of the grasps that count towards the requested number: valid, or without validation feasible."""
         return "feasible" if self.validation == "none" else "valid"
 
     @property
     def standing(self) -> Literal["valid", "feasible", "kept"]:
-        """Grasps that tables count: `counted`, or all stored ones if candidates are wanted without validation."""
+        """Status of the grasps that tables count: `counted`, or all stored ones for unvalidated candidates."""
         return "kept" if self.counted == "feasible" and self.want == "candidates" else self.counted
 
     def rechecks_of(self, batch: int) -> int:
-        """Return the number of rechecks of a batch: the first batches have some, by default every other one."""
+        """Return the number of rechecks of a batch; by default, every other of the first batches has one."""
         if self.validation in ("none", "dexgraspbench"):
             return 0
         if self.rechecks == RECHECKS:
@@ -449,7 +424,7 @@ def count_batches(grasps: int) -> int:
 
 
 def check_digests(options: JobOptions) -> None:
-    """Raise ValueError if a neighbour or the network has no digest; its name may later mean other files."""
+    """Raise ValueError if a neighbour or the network has no digest: a name may later refer to other files."""
     if any(one.digest is None for one in options.beside):
         raise ValueError("each neighbour of a stored job has the digest of its files")
     if options.network and not re.fullmatch(DIGEST, options.network):

@@ -25,11 +25,8 @@ class GraspdError(Exception):
     title: ClassVar[str] = "Something went wrong"
 
     def __str__(self) -> str:
-        # Quoted keys, file names or library messages may contain line breaks and escapes, which would forge lines in
-        # logs and terminals. Printable text does not change.
+        # Line breaks and escapes in quoted names or library messages would forge lines in logs and terminals.
         text = without_secrets(super().__str__())
-        if text.isprintable():
-            return text
         return _CONTROL.sub(lambda found: repr(found[0])[1:-1], _BREAK.sub(" ", text))
 
 
@@ -52,7 +49,7 @@ class ConflictError(InputError):
 
 
 class AssetError(InputError):
-    """A hand or an object cannot be used; `facts` are findings up to the error, for the report of a check."""
+    """A hand or an object cannot be used; `facts` has the findings of the check until the error."""
 
     def __init__(self, message: str = "", *, facts: Mapping[str, Any] | None = None) -> None:
         super().__init__(message)
@@ -60,7 +57,7 @@ class AssetError(InputError):
 
     @classmethod
     def with_fixes(cls, problem: str, hint: str, *fixes: Mapping[str, Any], **facts: Any) -> Self:
-        """Create an error with fixes: command options (`hint`) and keys of `asset.json` (None: any value)."""
+        """Create an error with command options in `hint`, keys of `asset.json` in `fixes` (None: any value)."""
         return cls(f"{problem}; {hint}", facts={"problem": problem, "options_suggested": list(fixes), **facts})
 
 
@@ -147,7 +144,7 @@ class BusyError(GraspdError):
 
 
 class DamagedError(GraspdError):
-    """A record in the store does not match its name; retrying does not help."""
+    """A stored object does not match its name or checksum; a retry does not help."""
 
     slug, title = "damaged", "A record in the store is damaged"
 
@@ -171,7 +168,7 @@ class TaskCancelled(TaskError):
 
 
 class TaskRefused(TaskError):
-    """The task has an unknown schema or function and must not run here; it is never retried."""
+    """The task has an unknown schema or function; the worker must neither run nor retry it."""
 
     slug, title = "task-refused", "The task was refused"
 
@@ -194,7 +191,7 @@ _API_KEY: Final = re.compile(r"\bgd_[A-Za-z0-9_-]{8,}")
 
 
 def without_secrets(text: str) -> str:
-    """Replace API keys, and passwords in URLs, by stars."""
+    """Replace API keys, and passwords in URLs, with stars."""
     if "://" in text:
         text = _PARAMETER.sub(r"\1***", _LOGIN.sub("***@", text))
     return _API_KEY.sub("gd_***", text) if "gd_" in text else text
@@ -206,7 +203,7 @@ _LISTED: Final = 20
 
 
 def available_names(word: str, names: Sequence[str]) -> str:
-    """Return `; there are: A, B` with the first names, and a hint if one name is similar to `word`."""
+    """Return `; there are: A, B` with the first names, and a hint if a name is similar to `word`."""
     listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
     return f"; there are: {listed or 'none yet'}{did_you_mean(word, names)}"
 

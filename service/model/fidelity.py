@@ -11,7 +11,7 @@ from graspd.service.model.errors import did_you_mean
 
 
 class Fidelity(Model):
-    """Planner settings that decide accuracy and cost. `graspd chart` measures the cost of each fidelity."""
+    """Settings of a planner that decide accuracy and cost; `graspd chart` measures both."""
 
     name: str = Field("custom", max_length=64)
     starts: int = Field(4, ge=1, le=64, description="starts for each grasp; half as many with rollouts")
@@ -22,24 +22,21 @@ class Fidelity(Model):
         4000,
         ge=16,
         le=65536,
-        description="object surface points tested against the links; three times as many around a free object, up "
-        "to 12,000",
+        description="object surface points tested against links; for free objects * 3, max 12,000",
     )
     face_error_m: float = Field(3e-4, ge=0, le=0.01, description="error bound of the simplified object [m]")
     coarse_iterations: int = Field(100, ge=0, le=100_000)
     fine_iterations: int = Field(40, ge=0, le=100_000)
     polish_iterations: int = Field(10, ge=0, le=100, description="Gauss-Newton steps that resolve penetration")
-    patience: int = Field(
-        10, ge=0, le=100_000, description="fine iterations without improvement before a grasp stops; 0: never"
-    )
+    patience: int = Field(10, ge=0, le=100_000, description="fine iterations without improvement before a stop; 0: off")
     velocities: Literal[7, 13] = Field(7, description="number of one-step simulations, one per object velocity (M)")
     contact_solver: Literal["direct", "jacobi", "gauss_seidel"] = "direct"
     optimizer: Literal["adam", "gd"] = "adam"
     leak: Literal["one_sided", "two_sided"] = "one_sided"
     dilation: Literal["fixed", "touch"] = Field(
-        "fixed", description="first dilation of the object. fixed: 10 mm; touch: until it touches the hand"
+        "fixed", description="first dilation of the object. fixed: 10 mm; touch: until the object touches the hand"
     )
-    simulate: bool = Field(True, description="False: hands are only attracted to the surface, as a control experiment")
+    simulate: bool = Field(True, description="False: control experiment, hands are only attracted to the surface")
     phong_alpha: float = Field(0.5, ge=0, le=1)
 
 
@@ -88,10 +85,8 @@ FIDELITIES: Final[dict[str, Fidelity]] = {
 }
 
 
-#: Value for the cheapest fidelity that meets the target; the stored job has that fidelity.
+#: Placeholder for the cheapest fidelity that meets the target; the stored job has the name of that fidelity.
 AUTO: Final = "auto"
-
-
 #: Fidelities for users; other fidelities are for comparisons.
 OFFERED: Final = ("draft", "standard", "fine")
 
@@ -101,8 +96,6 @@ def resolve_fidelity(value: str | Fidelity) -> Fidelity:
     if isinstance(value, Fidelity):
         return value
     if value not in FIDELITIES:
-        meant = did_you_mean(str(value), FIDELITIES)
-        raise ValueError(
-            f"unknown fidelity {value!r}; choose one of {', '.join(FIDELITIES)}, or give its settings{meant}"
-        )
+        hint = did_you_mean(value, FIDELITIES)
+        raise ValueError(f"unknown fidelity {value!r}; choose one of {', '.join(FIDELITIES)}, or give settings{hint}")
     return FIDELITIES[value]

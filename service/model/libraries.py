@@ -1,7 +1,6 @@
 """Installed libraries: cached versions, and imports without garbage collection.
 
-The modules of one process contain half a million Python objects. Garbage collections during imports and at exit would
-scan all of them; this takes half of the time of start and exit.
+Garbage collections scan half a million objects of imported modules, and take half of the time of start and exit.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ _ours = False
 
 
 def mark_process() -> None:
-    """Mark this process as graspd's own: imported objects stay until exit, without garbage collection."""
+    """Exclude imported objects from garbage collection in this process, which must be graspd's own."""
     global _ours
     _ours = True
 

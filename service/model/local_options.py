@@ -17,7 +17,7 @@ from graspd.service.model.scene_spec import MOST_NEIGHBOURS, MOST_SCENES, SceneS
 
 _LOCAL: Final[tuple[Place, ...]] = ("synth", "python")
 _COMMAND: Final[tuple[Place, ...]] = ("synth",)
-#: Scene fields of a job; in this process `SceneSpec` replaces them.
+#: Scene fields of a job; local commands use a `SceneSpec` instead.
 _OF_PLACE: Final = {"scene", "faces", "neighbours", "touch", "scenes"}
 
 
@@ -44,10 +44,9 @@ class LocalOptions(MeshOptions, JobOptions):
     )
     payload: Annotated[bool, Option("advanced", _LOCAL, "--payload/--no-payload")] = Field(
         False,
-        description="measure the heaviest mass that each valid grasp lifts; graspd synth does so by default in scenes "
-        "with a given mass",
+        description="measure the payload of each valid grasp; default of graspd synth in scenes with a given mass",
     )
-    # A value may be a file path; a job has the file's digest instead.
+    # A value may be a path of a file; a job has the digest of the file instead.
     options: Annotated[dict[str, Any], Option("advanced", _LOCAL, "--option")] = Field(
         default_factory=dict, description="option of the planner, such as steps=20000 or network=net.npz"
     )
@@ -55,8 +54,7 @@ class LocalOptions(MeshOptions, JobOptions):
     threads: Annotated[int, Option(places=_LOCAL)] = Field(0, ge=0, description="CPU threads; 0: one per core")
     join: Annotated[int | Literal["auto"], Option(places=_LOCAL)] = Field(
         "auto",
-        description="batches of 32 planned in one launch; auto: as many as fill a GPU, 1 on a CPU. The grasps do "
-        "not depend on it",
+        description="batches of 32 per kernel launch, without effect on grasps; auto: enough to fill a GPU, 1 on a CPU",
     )
 
     @field_validator("fidelity")
@@ -88,8 +86,7 @@ class LocalOptions(MeshOptions, JobOptions):
     @property
     def place(self) -> SceneSpec:
         """The scene; InputError if a file cannot be used."""
-        beside = [str(one) for one in self.neighbours]
-        return parse_scene(str(self.scene), faces=self.faces, touch=self.touch, beside=beside)
+        return parse_scene(str(self.scene), faces=self.faces, touch=self.touch, beside=[*map(str, self.neighbours)])
 
     @property
     def mesh(self) -> dict[str, Any]:
@@ -97,7 +94,7 @@ class LocalOptions(MeshOptions, JobOptions):
         return {name: value for name in sorted(given) if (value := getattr(self, name))}
 
     def request(self, options: dict[str, Any]) -> JobOptions:
-        """Return the job without scene and rechecks; `options` has digests of files. InputError if invalid."""
+        """Return job options without scene and rechecks; `options` has digests of files. Raise InputError."""
         shared = {name: getattr(self, name) for name in JobOptions.model_fields.keys() - _OF_PLACE}
-        # Rechecks are a sample over many jobs; a single file can be validated completely at level `dexgraspbench`.
+        # Rechecks sample many jobs; a single file can be validated completely at level `dexgraspbench`.
         return validate(JobOptions, shared | {"fidelity": self.knobs, "options": options, "rechecks": 0})

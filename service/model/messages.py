@@ -1,7 +1,7 @@
-"""Messages in Redis: tasks with origin and requirements, reports and capabilities of workers.
+"""Messages in Redis: tasks with origin and requirements, heartbeats and capabilities of workers.
 
-Several versions may run in parallel. A message states a range of schemas: from the oldest that can express it to the
-newest that its writer supports. A worker also reads a range, and has one revision of each stage.
+Several versions of graspd may run in parallel. A message states a range of schemas: from the oldest schema that can
+express the message to the newest schema of its writer. A worker also reads a range, and has one revision per stage.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graspd.service.model.version import OLDEST_TASK_SCHEMA, PACKAGE_VERSION, ST
 
 
 class Origin(Model):
-    """Origin of a job, for logs of its tasks and for fair scheduling between keys."""
+    """Origin of a job, for log lines of its tasks and for fair scheduling."""
 
     request: str = Field("", max_length=64, description="id of the HTTP request")
     key: str = Field("", max_length=64, description="name of the API key")
@@ -31,16 +31,16 @@ class Origin(Model):
 
 
 class TaskMessage(Model):
-    """Message of a task; a worker needs only this and the store."""
+    """Message of a task; a worker needs no other data than this message and the store."""
 
-    # The alias is needed because the message's field `schema` is an attribute of BaseModel.
+    # The alias is needed because `schema` is a method of BaseModel.
     schema_: int = Field(alias="schema", description="oldest schema that can express the message")
     newest_schema: int = Field(0, ge=0, description="newest schema that the writer supports; 0: the same as `schema`")
     task_id: Word
     job_id: Word
     stage: Stage
     batch: int = Field(ge=0, description="first batch of the range")
-    count: int = Field(ge=1, description="grasps wanted from all batches of the range; all but the last batch are full")
+    count: int = Field(ge=1, description="requested grasps of the range; all batches but the last one are full")
     revision: int = Field(1, ge=1, description="revision of the stage's algorithm, part of the id of the output")
     attempt: int = Field(1, ge=1)
     max_attempt: int = Field(3, ge=1, description="number of the last attempt")
@@ -79,7 +79,7 @@ def message_type(raw: Mapping[str, Any]) -> type[TaskMessage | IngestMessage]:
     return IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage
 
 
-#: Any client can write to Redis, so values from there have bounded lengths and sizes.
+#: Any client can write to Redis, so values from Redis have limited lengths and sizes.
 HostWord = Annotated[str, Field(max_length=300)]
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
@@ -87,7 +87,7 @@ Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
 
 @dataclass(frozen=True)
 class WorkerBeat:
-    """Status report of a living worker."""
+    """Heartbeat of a worker, with its status and progress."""
 
     name: HostWord
     host: HostWord
@@ -103,7 +103,7 @@ class WorkerBeat:
     seen: Annotated[str, Field(max_length=32)]
     reason: Annotated[str, Field(max_length=300)] = ""
     schemas: tuple[Count, Count] = (0, 0)
-    """Oldest and newest readable schema of task messages; workers of graspd 0.1 report none and get no tasks."""
+    """Oldest and newest schema that the worker reads; (0, 0) for graspd 0.1, whose workers get no tasks."""
     revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
     done: Amount = 0.0
     total: Amount = 0.0
@@ -131,7 +131,7 @@ class Requirements:
     schema: int
     newest: int
     revision: int
-    """Revision of the stage; 0 for the check of an asset, which has no revision."""
+    """Revision of the stage; 0 for ingest, which has no revision."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +140,7 @@ class Capabilities:
     revisions: Mapping[str, int]
 
     def lacks(self, need: Requirements) -> str:
+        """Return the first requirement that the worker does not meet, as a sentence; "" if it meets all."""
         oldest, newest = self.schemas
         if need.schema > newest:
             return f"the task needs schema {need.schema}, but the worker reads at most schema {newest}"

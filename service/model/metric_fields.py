@@ -1,4 +1,4 @@
-"""Fields of models derived from the table of metrics."""
+"""Fields of pydantic models, derived from the table of metrics."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ else:
 
 
 def value_fields(*, optional: bool, default: Any = ...) -> dict[str, Any]:
-    # Manifests list the sorted metrics first.
-    chosen = sorted(indexed_metrics(), key=lambda metric: metric.indexed < IndexLevel.SORTED)
+    """Return the type and field of each required or optional metric in the index, sorted metrics first."""
     return {
         metric.name: (int | None if metric.whole else float | None, Field(default, description=metric.meaning))
-        for metric in chosen
+        for metric in sorted(indexed_metrics(), key=lambda metric: metric.indexed < IndexLevel.SORTED)
         if metric.optional == optional
     }
 
@@ -43,23 +42,17 @@ def filter_fields() -> dict[str, Any]:
 
 
 def insert_fields(**parts: Mapping[str, Any]) -> Callable[[type[M]], type[M]]:
-    """Decorate a model: insert each group of fields before the field of the same name, `last` at the end."""
+    """Decorate a model: insert each group of fields before the field of that name, `last` at the end."""
 
-    def made(model: type[M]) -> type[M]:
+    def decorate(model: type[M]) -> type[M]:
         base: type[BaseModel] = next(base for base in model.__bases__ if issubclass(base, BaseModel))
         fields: dict[str, Any] = {}
         for name, field in model.model_fields.items():
             if name not in base.model_fields:
-                fields |= dict(parts.get(name, {})) | {name: (field.annotation, field)}
-        fields |= dict(parts.get("last", {}))
-        anew = create_model(
-            model.__name__,
-            __base__=base,
-            __cls_kwargs__=dict(model.model_config),
-            __module__=model.__module__,
-            __doc__=model.__doc__,
-            **fields,
-        )
-        return cast(type[M], anew)
+                fields |= {**parts.get(name, {}), name: (field.annotation, field)}
+        options: dict[str, Any] = {"__cls_kwargs__": dict(model.model_config), "__doc__": model.__doc__}
+        fields |= parts.get("last", {})
+        new = create_model(model.__name__, __base__=base, __module__=model.__module__, **options, **fields)
+        return cast(type[M], new)
 
-    return made
+    return decorate

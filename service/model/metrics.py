@@ -1,9 +1,8 @@
 """Table of all grasp metrics; perturbed parameters, grasp types and approach directions.
 
-Storage (`service.store.columns`), manifests, index, API, dashboard, dataset cards and docs derive from this table. A
-new metric needs a row here and a function (`MEASURES` in `worker.quality.table`); make it `optional`, since older
-shards lack it. The index adds the column when it opens (`service.index.database`). A yes-or-no property of a grasp
-is a verdict, not a metric.
+Shards (`service.store.columns`), manifests, index, API, dashboard, dataset cards and docs derive from this table. A
+new metric needs a row here and a function (`MEASURES` in `worker.quality.table`). It must be `optional`, because older
+shards lack it. A yes-or-no property of a grasp is a verdict, not a metric.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Literal
 
-#: Column titles shorter than this are symbols, whose case is kept.
+#: Column titles shorter than this are symbols, whose case has a meaning.
 _SYMBOL: Final = 4
 
 
@@ -33,9 +32,9 @@ class IndexLevel(IntEnum):
 @dataclass(frozen=True)
 class GraspMetric:
     name: str
-    """Name of the metric everywhere except in base shards, where its dataset is `quality/{name}`."""
+    """Name everywhere except in base shards, where the dataset is `quality/{name}`."""
     units: str
-    """Unit as in the shard, such as `cm^2`; `1`: no unit."""
+    """Unit in the shard, such as `cm^2`; `1`: no unit."""
     meaning: str
     title: str
     short: str = ""
@@ -161,8 +160,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "robust_share",
         "1",
-        "share of perturbed models in which the grasp holds; nan: not tested. If the test ended "
-        "early: a bound on the same side of the required share",
+        "share of perturbed models in which the grasp holds, or a bound of it if the test ended early; nan: not tested",
         title="Robust share",
         short="Robust",
         optional=True,
@@ -173,8 +171,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "payload_kg",
         "kg",
-        "heaviest mass, from the object's own upwards, that the grasp lifts in its scene or holds "
-        "under the six pushes; nan: not measured",
+        "heaviest mass, at least the object's, that the grasp lifts in a scene or holds if pushed; nan: not measured",
         title="Payload",
         optional=True,
         bounds=(0, 100),
@@ -184,8 +181,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "shake_margin",
         "1",
-        "largest ratio of displacement or rotation in the hand to its limit while shaken after the lift; "
-        "below 1: held; nan: not shaken",
+        "largest ratio of motion in the hand to its limit while shaken after the lift; below 1: held; nan: not shaken",
         title="Motion when shaken",
         short="Shaken",
         optional=True,
@@ -258,8 +254,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "approach_cell",
         "1",
-        "direction from which the palm approaches, in the object's frame: one of 48 cells of equal "
-        "area; number = 12 x band of height + azimuth sector",
+        "direction of approach in the object's frame: one of 48 equal-area cells, 12 x band of height + azimuth sector",
         title="Approach cell",
         whole=True,
         code=True,
@@ -283,13 +278,13 @@ def indexed_metrics(least: IndexLevel = IndexLevel.KEPT) -> tuple[GraspMetric, .
     return tuple(metric for metric in GRASP_METRICS if metric.indexed >= least)
 
 
+#: Default and maximum number of perturbed models.
 ROBUST_MODELS: Final = 8
-
 MOST_ROBUST_MODELS: Final = 64
 
 
 class Axis(IntEnum):
-    """Parameter perturbed from the nominal model. Shards contain its number: add new axes at the end only."""
+    """Perturbed parameter of a model. Shards contain its number, so new parameters must be appended."""
 
     NONE = 0
     SHAPES = 1
@@ -336,23 +331,21 @@ class GraspType(IntEnum):
     LATERAL = 3
 
 
-#: Cells of directions have equal area: bands of equal height z (Archimedes), each divided into equal azimuth ranges.
+#: Approach cells have equal area: bands of equal height z (Archimedes), each divided into equal azimuth sectors.
 BANDS: Final = 4
 SECTORS: Final = 12
-
 DIRECTION_CELLS: Final = BANDS * SECTORS
 
-#: Distance [m] below which two grasps are near-duplicates: mean over corresponding points of the hand's
-#: surface. Twice this distance is hardly visible in a picture; near-duplicates occur in fewer than 1 in 100 pairs of
-#: batches.
+#: Mean distance of corresponding points of the hand [m] below which two grasps are near-duplicates. Twice this
+#: distance is hardly visible in a picture. Fewer than 1 in 100 pairs of batches have near-duplicates.
 MIN_DISTANCE_M: Final = 0.005
 
 
 def entropy_bits(counts: Iterable[int]) -> float:
     """Return the Shannon entropy [bit] of a distribution over categories; 0 for one category or no grasps."""
-    known = [count for count in counts if count > 0]
-    total = sum(known)
-    return -sum(count / total * math.log2(count / total) for count in known) + 0.0
+    positive = [count for count in counts if count > 0]
+    total = sum(positive)
+    return -sum(count / total * math.log2(count / total) for count in positive) + 0.0
 
 
 def evenness(counts: Iterable[int], kinds: int) -> float:

@@ -1,4 +1,4 @@
-"""Keys of the object store: this module builds all keys that graspd writes (table in ARCHITECTURE.md)."""
+"""Keys of all objects that graspd writes to the store; ARCHITECTURE.md has a table."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TAGS: Final = "tags"
 SERVICE: Final = "service"
 MARKS: Final = "marks"
 
-#: Kind of each stage's result: folder under `shards/` and HDF5 kind.
+#: Kind of the shards of each stage: folder below `shards/` and HDF5 kind.
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
 
 
@@ -135,15 +135,13 @@ log = logging.getLogger(__name__)
 def check_length(name: str) -> str:
     """Return a name that a user chose; InputError if it is too long."""
     if len(name) > MOST:
-        raise InputError(
-            f"the name {name} has {len(name)} characters, and at most {MOST} are allowed; give a shorter one"
-        )
+        raise InputError(f"the name {name} has {len(name)} characters, more than {MOST}; give a shorter one")
     return name
 
 
 @lru_cache(maxsize=4096)
 def shorten(name: str, most: int = MOST) -> str:
-    """Return the name; shorten a long one to its beginning and a digest, and log it once."""
+    """Return the name; replace a long name by its beginning and a digest, and log this once."""
     if len(name) <= most:
         return name
     short = f"{name[: most - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"

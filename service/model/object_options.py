@@ -33,9 +33,7 @@ class ObjectOptions(MeshOptions):
     licence: str = ""
     source: str = ""
     facts: dict[str, Any] = Field(default_factory=dict)
-    density: Annotated[Density | None, _MATTER] = Field(
-        None, description="density of the object [kg/m^3], instead of the mass"
-    )
+    density: Annotated[Density | None, _MATTER] = Field(None, description="density [kg/m^3], instead of the mass")
     mass: Annotated[Mass | None, _MATTER] = Field(None, description=f"mass of the object [kg]; default: {MASS_KG:g}")
     friction: Annotated[Friction | None, _MATTER] = Field(
         None, description=f"Coulomb coefficient of the object's contacts in simulation; default: {FRICTION:g}"

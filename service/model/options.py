@@ -1,7 +1,4 @@
-"""Metadata of job options besides type, default, bounds and description; tables of the options.
-
-Command line, dashboard forms, Python signatures and tables of the docs derive from `rows`.
-"""
+"""Tables of options: command line, dashboard forms, Python signatures and docs derive from `rows`."""
 
 from __future__ import annotations
 
@@ -21,7 +18,7 @@ from graspd.service.model.errors import InputError
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
-#: Places of an option: job of the service, command `graspd synth`, `graspd.synthesize`, file of an asset.
+#: Interfaces with an option: job of the service, command `graspd synth`, `graspd.synthesize`, file of an asset.
 Place = Literal["job", "synth", "python", "asset"]
 EVERYWHERE: Final[tuple[Place, ...]] = ("job", "synth", "python")
 JOB: Final[tuple[Place, ...]] = ("job",)
@@ -30,6 +27,8 @@ _UNIT: Final = re.compile(r"\[([^\]]+)\]")
 
 @dataclass(frozen=True)
 class Form:
+    """Input of an option in a dashboard form."""
+
     section: Literal["grasps", "scenes"]
     label: str
     hint: str = ""
@@ -42,6 +41,8 @@ class Form:
 
 @dataclass(frozen=True)
 class Option:
+    """Metadata of an option besides type, default, bounds and description."""
+
     group: Literal["basic", "advanced"] = "advanced"
     places: tuple[Place, ...] = EVERYWHERE
     flags: str = ""
@@ -90,7 +91,7 @@ class Row:
 
     @property
     def kind(self) -> Any:
-        """Type for a command line or form: bool, int, float, str, a Literal of strings, or list[str]."""
+        """Type on a command line or in a form: bool, int, float, str, a Literal of strings, or list[str]."""
         return _kind(self.field.annotation)
 
 
@@ -105,7 +106,7 @@ def rows(model: type[BaseModel], place: Place) -> list[Row]:
 
 
 def validate(model: type[ModelT], values: Mapping[str, Any], *, names: Mapping[str, str] | None = None) -> ModelT:
-    """Validate values; InputError states the first invalid one, by its name in `names` if given."""
+    """Validate values; InputError reports the first invalid field, with its name in `names` if given."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -113,16 +114,16 @@ def validate(model: type[ModelT], values: Mapping[str, Any], *, names: Mapping[s
 
 
 def with_keywords(model: type[BaseModel], place: Place) -> Callable[[FunctionT], FunctionT]:
-    """Decorate a function that takes `**options`: its signature shows each option as a keyword."""
+    """Decorate a function with a parameter `**options`: its signature shows each option as a keyword."""
 
     def decorate(function: FunctionT) -> FunctionT:
-        written = inspect.signature(function)
-        own = [one for one in written.parameters.values() if one.kind is not inspect.Parameter.VAR_KEYWORD]
+        signature = inspect.signature(function)
+        own = [one for one in signature.parameters.values() if one.kind is not inspect.Parameter.VAR_KEYWORD]
         options = [
             inspect.Parameter(row.name, inspect.Parameter.KEYWORD_ONLY, default=row.default, annotation=text)
             for row, text in keywords_of(model, place)
         ]
-        function.__signature__ = written.replace(parameters=[*own, *options])  # type: ignore[attr-defined]
+        function.__signature__ = signature.replace(parameters=[*own, *options])  # type: ignore[attr-defined]
         return function
 
     return decorate
@@ -133,7 +134,7 @@ def keywords_of(model: type[BaseModel], place: Place) -> list[tuple[Row, str]]:
 
 
 def type_text(annotation: Any) -> str:
-    """Format an annotation for callers, without bounds; models become mappings."""
+    """Return an annotation as source text, without bounds; models become mappings."""
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return type_text(inner[0])
@@ -145,7 +146,7 @@ def type_text(annotation: Any) -> str:
         return f"Sequence[{type_text(inner[0])}]"
     if origin is dict:
         return f"Mapping[{', '.join(map(type_text, inner))}]"
-    if annotation is None or annotation is type(None):
+    if annotation is type(None):
         return "None"
     if inspect.isclass(annotation) and issubclass(annotation, BaseModel):
         return "Mapping[str, Any]"

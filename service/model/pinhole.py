@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 
-#: Neighbouring pixels whose depths differ by more than this share belong to two surfaces.
+#: Relative difference of depth above which neighbouring pixels belong to two surfaces.
 EDGE: Final = 0.02
-#: Cost of a side with only one pixel, equal to the cost of an edge between faces.
+#: Cost of a one-sided difference with unknown bend, equal to the cost of an edge between two faces.
 _BEND_UNKNOWN: Final = 0.5
 
 
@@ -32,8 +32,8 @@ def back_project(k: Floats, depth: NDArray[Any]) -> Floats:
 def surface_normals(points: Floats) -> Floats:
     """Compute unit normals (H, W, 3) of points (H, W, 3), directed toward the camera; nan where undefined.
 
-    Tangents are one-sided differences, on the side with less bend and no jump; thus each normal belongs to the face
-    that its pixel shows. Bend is the second difference of 1 / z, which is linear in pixels on a plane.
+    Tangents are one-sided differences, on the side with less bend and no jump, so that no normal mixes two faces. Bend
+    is the second difference of 1 / z, which is linear in pixels on a plane.
     """
     along, down = _tangent(points, 1), _tangent(points, 0)
     normal = np.cross(down, along)
@@ -47,23 +47,20 @@ def _tangent(points: Floats, axis: int) -> Floats:
     step = np.diff(points, axis=axis)
     gap = np.full_like(np.take(points, [0], axis=axis), np.nan)
     ahead, behind = np.concatenate([step, gap], axis=axis), np.concatenate([gap, step], axis=axis)
+    depth = points[..., 2]
     with np.errstate(invalid="ignore", divide="ignore"):
-        bend = np.abs(np.diff(1 / points[..., 2], 2, axis=axis)) * np.take(
-            points[..., 2], range(1, points.shape[axis] - 1), axis=axis
-        )
-    none = np.full_like(np.take(points[..., 2], [0, 0], axis=axis), np.nan)
+        bend = np.abs(np.diff(1 / depth, 2, axis=axis)) * np.take(depth, range(1, depth.shape[axis] - 1), axis=axis)
+    none = np.full_like(np.take(depth, [0, 0], axis=axis), np.nan)
     bent_ahead, bent_behind = np.concatenate([bend, none], axis=axis), np.concatenate([none, bend], axis=axis)
     cost_ahead, cost_behind = _cost(ahead, bent_ahead, points), _cost(behind, bent_behind, points)
     return np.where((cost_ahead <= cost_behind)[..., None], ahead, behind)
 
 
 def _cost(step: Floats, bend: Floats, points: Floats) -> Floats:
-    """Return the cost of a one-sided difference: its bend, higher across an edge, highest without a point."""
+    """Return the cost of a one-sided difference: bend, more across an edge, infinite without a point."""
     with np.errstate(invalid="ignore"):
         jump = np.abs(step[..., 2]) / points[..., 2]
-    cost = np.where(np.isnan(bend), _BEND_UNKNOWN, np.minimum(bend, _BEND_UNKNOWN)) + np.where(
-        jump > EDGE, 1.0 + jump, 0.0
-    )
+    cost = np.fmin(bend, _BEND_UNKNOWN) + np.where(jump > EDGE, 1.0 + jump, 0.0)
     return np.where(np.isnan(jump), np.inf, cost)
 
 
@@ -75,11 +72,11 @@ def fitted_normals(
     Args:
         points: (H, W, 3) in the camera frame [m]; nan: a hole.
         row, column: (P,) pixels.
-        radius: the window is 2 radius + 1 pixels wide.
-        gap_m: (P,) neighbours are ignored if their depth differs by more than this [m].
+        radius: half width of a window; the full width is 2 radius + 1 pixels.
+        gap_m: (P,) largest difference of depth to points of the window that count [m].
 
     Returns:
-        Direction of least variance of each window; the direction to the camera if fewer than three points count.
+        Direction of least variance in each window; the direction to the camera if fewer than three points count.
     """
     offset = np.arange(-radius, radius + 1)
     height, width = points.shape[:2]

@@ -1,18 +1,17 @@
 """Planning of jobs in pure functions: tasks and their states, fair scheduling, outcomes of candidates.
 
-A job is split into batches of `BATCH_SIZE` grasps, the unit of seeds and launches. Ranges of `JobRecord.span` batches
-are chains of tasks, one task per requested stage: synthesize -> scene -> render, or for grasps planned in scenes:
-scene -> synthesize -> render.
+A job is split into batches of `BATCH_SIZE` grasps. Each range of `JobRecord.span` batches has one task per requested
+stage: synthesize -> scene -> render, or for grasps planned in scenes: scene -> synthesize -> render.
 """
 
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from graspd.service.model.digests import digest_json, shard_id
 from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest, count_batches
@@ -48,7 +47,7 @@ class TaskFacts:
     last_attempt: int = 0
     exhausted: bool = False
     retried_upto: int = 0
-    """Number of the last attempt before the latest retry by a user; attempts up to this number are ignored."""
+    """Number of the last attempt before the latest retry by a user; these attempts are ignored."""
     running: bool = False
 
 
@@ -75,16 +74,14 @@ def count_ranges(grasps: int, span: int) -> int:
 def plan_tasks(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedTask]:
     """Yield the tasks of a job for all or some `ranges`, range by range in the order of stages."""
     request = job.request
-    digests = {"hand_digest": job.hand_digest, "object_digest": job.object_digest}
+    digests: dict[str, Any] = {"hand_digest": job.hand_digest, "object_digest": job.object_digest}
     for number in ranges if ranges is not None else range(count_ranges(request.grasps, job.span)):
         batch = number * job.span
         count = min(job.span * BATCH_SIZE, request.grasps - batch * BATCH_SIZE)
         inputs: tuple[str, ...] = ()
         for stage in stages_of(request):
-            revision = job.revisions[stage]
-            output = shard_id(
-                stage, request=request, batch=batch, count=count, revision=revision, inputs=inputs, **digests
-            )
+            facts = digests | {"batch": batch, "count": count, "revision": job.revisions[stage], "inputs": inputs}
+            output = shard_id(stage, request=request, **facts)
             yield PlannedTask(task_id(job.id, stage, batch), stage, batch, count, inputs, output)
             inputs = (output,)
 
@@ -110,13 +107,12 @@ def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: 
     )
 
 
-#: First schema of each newer option. Jobs with such an option need workers with that schema; older workers run all
-#: other jobs.
+#: First schema of each newer option: only jobs with such an option need newer workers.
 _SCHEMAS: Final = {row.name: row.option.schema for row in rows(JobOptions, "job") if row.option.schema}
 
 
 def needed_schema(request: JobRequest, since: Mapping[str, int] = _SCHEMAS) -> int:
-    """Return the oldest schema that can express a request: the schema of its newest option in use."""
+    """Return the oldest schema that can express a request: the schema of its newest option with a value."""
     fields = JobRequest.model_fields
     used = [schema for name, schema in since.items() if getattr(request, name) != fields[name].get_default()]
     used += [SCHEMA_OF_NETWORKS] if request.network else []
@@ -146,23 +142,18 @@ def ingest_message(kind: AssetKind, name: str, digest: str, *, attempt: int, max
 
 
 def range_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[State]:
-    """Return the states of one range's tasks; tasks after a failed or cancelled one are cancelled."""
+    """Return the states of one range's tasks; tasks after a failed or cancelled task are cancelled."""
     states: list[State] = []
-    blocked = False
     for facts in chain:
         state = _own_state(facts, job_cancelled=job_cancelled)
-        if blocked and not state.is_final:
-            state = State.CANCELLED
-        states.append(state)
-        blocked = blocked or state in (State.FAILED, State.CANCELLED)
+        is_blocked = State.FAILED in states or State.CANCELLED in states
+        states.append(State.CANCELLED if is_blocked and not state.is_final else state)
     return states
 
 
 def range_ready_mask(states: Sequence[State]) -> list[bool]:
-    """Return which tasks of a range are ready to start: unfinished, with all earlier tasks succeeded."""
-    return [
-        not state.is_final and all(before is State.SUCCEEDED for before in states[:i]) for i, state in enumerate(states)
-    ]
+    """Return a mask of the tasks of a range that can start: unfinished, and all earlier tasks succeeded."""
+    return [not state.is_final and set(states[:i]) <= {State.SUCCEEDED} for i, state in enumerate(states)]
 
 
 def job_state(tasks: Iterable[State]) -> State:
@@ -187,32 +178,33 @@ def _own_state(facts: TaskFacts, *, job_cancelled: bool) -> State:
 T = TypeVar("T")
 #: Maximum number of jobs in one scheduling round; other jobs follow in later rounds.
 JOBS_A_ROUND: Final = 64
-#: Number of remembered turns, greater than the number of waiting jobs: a forgotten job comes first again.
+#: Number of remembered turns, greater than the number of waiting jobs; a forgotten job comes first again.
 _REMEMBERED: Final = 100_000
 
 
 @dataclass(frozen=True)
 class WaitingJob:
-    """Job with tasks ready for the queue, and the owner of its share (see `queue_owner`)."""
+    """Job with tasks ready for the queue."""
 
     id: str
     key: str
+    """Owner of the job's share of the queue (`queue_owner`)."""
 
 
 def queue_owner(project: str, key: str) -> str:
-    """Return the owner of a job's share of the queue: its project, or else its key ("" without keys)."""
+    """Return the owner of a job's share of the queue: the project, else the key ("" without keys)."""
     return f"project {project}" if project else key
 
 
 class RoundRobin:
-    """Fair scheduling by order of the latest turns; losing them at process end costs at most one turn."""
+    """Round-robin scheduling over owners, then over their jobs; the end of the process loses the turns."""
 
     def __init__(self) -> None:
         self._served: dict[str, int] = {}
         self._count = 0
 
     def order(self, jobs: Iterable[WaitingJob], limit: int) -> list[tuple[WaitingJob, int]]:
-        """Return the next jobs, each with the number of its tasks to queue; about `limit` tasks in total."""
+        """Return the next jobs, each with its number of tasks to queue; about `limit` tasks in total."""
         of_key: dict[str, list[WaitingJob]] = defaultdict(list)
         for job in sorted(jobs, key=lambda job: self._served.get(f"job {job.id}", 0)):
             of_key[job.key].append(job)
@@ -232,7 +224,7 @@ class RoundRobin:
 
 
 def interleave(lists: Sequence[Sequence[T]]) -> list[T]:
-    """Interleave lists: the first items of all, then the second ones, and so on."""
+    """Interleave lists: the first items of all lists, then the second items, and so on."""
     return [item for turn in zip_longest(*lists) for item in turn if item is not None]
 
 
@@ -263,11 +255,10 @@ OUTCOMES: Final = {
 
 
 def sum_outcomes(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    found: dict[str, int] = dict.fromkeys(OUTCOMES, 0)
+    found = Counter(dict.fromkeys(OUTCOMES, 0))
     for part in parts:
-        for name, count in part.items():
-            found[name] = found.get(name, 0) + int(count)
-    return {name: count for name, count in found.items() if count}
+        found.update(part)
+    return {name: int(count) for name, count in found.items() if count}
 
 
 def format_outcomes(outcomes: Mapping[str, int]) -> str:
@@ -278,18 +269,18 @@ def format_outcomes(outcomes: Mapping[str, int]) -> str:
 def explain_shortfall(
     found: int, wanted: int, counted: str, candidates: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
 ) -> str | None:
-    """Explain why fewer grasps were found than wanted, None if enough were; `limit` replaces the budget."""
+    """Explain why fewer grasps were found than requested, else return None; `limit` replaces the budget."""
     if found >= wanted:
         return None
     lost, tries = format_outcomes(outcomes), candidates + outcomes.get("repeated", 0)
-    ended = limit or f"the budget of {budget:g} candidates per grasp is exhausted"
-    return (
-        f"found {found:,} of {wanted:,} {counted} grasps in {tries:,} candidates{': ' if lost else ''}{lost}; {ended}"
+    details = (
+        (f": {lost}" if lost else "") + "; " + (limit or f"the budget of {budget:g} candidates per grasp is exhausted")
     )
+    return f"found {found:,} of {wanted:,} {counted} grasps in {tries:,} candidates{details}"
 
 
 def limit_text(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
-    """Describe a hand's payload limit; `bound` [kg] follows from actuators and friction (inf: no bound)."""
+    """Describe the payload limit of a hand [kg]; `bound` follows from actuators and friction (inf: none)."""
     most = f", and at most {bound:.2g} kg by actuator effort" if math.isfinite(bound) else ""
     less = "" if wanted is None else f"; {wanted:.3g} kg are wanted"
     return f"{hand} lifts {lifts:.2g} kg at friction {friction:g} in the best of {grasps} grasps{most}{less}"

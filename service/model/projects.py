@@ -8,10 +8,10 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-#: Lower case, so that names never differ only in case.
+#: Lower case only, so that no two names differ only in case.
 PATTERN: Final = r"^[a-z0-9][a-z0-9-]{0,31}$"
 Project = Annotated[str, Field(pattern=rf"^$|{PATTERN}")]
-#: File added to a project's private upload. The same mesh thus has another digest in each project, and digests reveal
+#: File added to a private upload. The same mesh then has different digests in different projects, and digests reveal
 #: nothing about other projects.
 MARK: Final = "graspd-project.txt"
 
@@ -21,7 +21,7 @@ class ProjectScope:
     """Visible resources: all, or those of one project and shared hands and objects."""
 
     project: str = ""
-    """Project whose resource is preferred if other projects have one of the same name."""
+    """Preferred project, if several projects have a resource of the same name."""
     everything: bool = True
 
     def can_see(self, project: str) -> bool:
@@ -33,5 +33,5 @@ EVERYTHING: Final = ProjectScope()
 
 
 def project_mark(files: Mapping[str, bytes], project: str) -> dict[str, bytes]:
-    """Return a private upload's mark; for a shared upload, an empty file that replaces an existing mark."""
+    """Return the file that marks a private upload; for a shared one, an empty file that replaces a mark."""
     return {MARK: project.encode()} if project or MARK in files else {}

@@ -1,6 +1,6 @@
 """JSON records of the store: jobs, datasets, tags, user actions, failed attempts.
 
-`datasets/{name}/dataset.json` lists the jobs of its cells, so later algorithms or names do not change a dataset.
+`datasets/{name}/dataset.json` lists the jobs of its cells, so that later algorithms or names do not change a dataset.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MOST_BATCHES: Final = 64
 
 
 class Record(BaseModel):
-    """Base class of records; unknown fields, of a newer graspd, are ignored."""
+    """Base class of records. Unknown fields are ignored, since a newer graspd may have written them."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -39,7 +39,7 @@ class Choice(Record):
     target: str = Field(description="required accuracy")
     chart: str = Field(description="key of the chart in the store")
     measured_on: Literal["hand and object", "hand", "all"] = Field(
-        description="runs of the chart that count: of the same hand and object, of the same hand, or all"
+        description="selected runs of the chart: of the same hand and object, of the same hand, or all"
     )
     reached: float = Field(description="accuracy of the chosen fidelity in these runs")
 
@@ -91,7 +91,7 @@ class JobRecord(Record):
 
 
 class JobEvent(Record):
-    """Later user action on a job. `retried` maps each failed task to its last attempt before the retry."""
+    """User action on a job. `retried` maps each failed task to its last attempt before the retry."""
 
     number: int = Field(ge=1)
     what: Literal["cancelled", "retried"]
@@ -117,14 +117,13 @@ class AttemptRecord(Record):
 
     @classmethod
     def of(cls, message: TaskMessage | IngestMessage, **facts: Any) -> Self:
-        job = message.job_id if isinstance(message, TaskMessage) else ""
-        return cls(
-            task_id=message.task_id, job_id=job, stage=message.stage, number=message.attempt, ended=timestamp(), **facts
-        )
+        """Return the record of the message's attempt, which ends now, with further fields `facts`."""
+        facts |= {"task_id": message.task_id, "job_id": getattr(message, "job_id", ""), "ended": timestamp()}
+        return cls(stage=message.stage, number=message.attempt, **facts)
 
 
 class Member(Record):
-    """Hand or object of a dataset, in the version at the dataset's creation."""
+    """Hand or object of a dataset, in its version at the creation of the dataset."""
 
     name: Name
     digest: Digest
@@ -146,8 +145,8 @@ class Cell:
 class DatasetRecord(Record):
     """`dataset.json`. `jobs` has one id per cell, ordered by hand, then by object.
 
-    With fidelity `auto`, `fidelities` has the chart's choice per cell at creation, and `chosen` the index of its reason
-    in `choices`.
+    With fidelity `auto`, `fidelities` has the chosen fidelity of each cell, and `chosen` the index of its reason in
+    `choices`.
     """
 
     version: Literal[1] = 1
@@ -184,7 +183,7 @@ class DatasetRecord(Record):
 
 
 class DatasetEvent(Record):
-    """Later user action on a dataset. The last action decides whether the dataset is cancelled."""
+    """User action on a dataset. The last action decides whether the dataset is cancelled."""
 
     number: int = Field(ge=1)
     what: Literal["cancelled", "retried"]
@@ -206,7 +205,7 @@ class SnapshotShard(Record):
     @field_validator("key")
     @classmethod
     def _convert_pack_key(cls, key: str, info: ValidationInfo) -> str:
-        # A snapshot of 0.2 may refer to a part of a pack; now each shard is a file.
+        # A key of graspd 0.2 may refer to a part of a pack; now each shard is a file.
         stages = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
         return names.shard_file_key(stages[info.data["kind"]], info.data["id"]) if "@" in key else key
 
@@ -239,6 +238,7 @@ class ObjectSet(Record):
 
 
 def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:
+    """Return the request of a cell; `fidelity` replaces `auto` and its target."""
     shared = {name: getattr(options, name) for name in JobOptions.model_fields}
     return JobRequest(hand=hand, object=obj, **shared | ({"fidelity": fidelity, "target": ""} if fidelity else {}))
 
@@ -262,18 +262,13 @@ def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: st
 def object_set_of(
     name: str, objects: Iterable[str], *, after: str = "", owner: str = "", project: str = ""
 ) -> ObjectSet:
+    """Return a version of a set; its digest includes `after`, the digest of the previous version."""
     members = tuple(sorted(set(objects)))
-    return ObjectSet(
-        name=name,
-        digest=digest_json([after, *members]),
-        objects=members,
-        created=timestamp(),
-        owner=owner,
-        project=project,
-    )
+    digest = digest_json([after, *members])
+    return ObjectSet(name=name, digest=digest, objects=members, created=timestamp(), owner=owner, project=project)
 
 
-#: Maximum numbers of tags of one project (or of one key without a project), and of grasps of one tag.
+#: Maximum number of tags of one project (or of one key without a project), and of grasps of one tag.
 MOST_TAGS: Final = 100
 MOST_TAGGED: Final = 20_000
 #: A grasp: shard id and row.

@@ -1,4 +1,4 @@
-"""Names of graspd 0.2, accepted by all readers; only tasks for workers of 0.2 are written with them."""
+"""Conversion of the names of graspd 0.2, which all readers accept and tasks for old workers contain."""
 
 from __future__ import annotations
 
@@ -31,7 +31,6 @@ COLUMNS: Final = {
 #: Revision of each stage in graspd 0.2.
 _REVISIONS: Final = {"synthesize": 23, "scene": 2, "render": 4}
 _OLD: Final = re.compile(f'"(?:{"|".join([*KEYS, *_LEVELS, "raw", _REMOVED])})"'.encode())
-
 #: Measures of charts: success under the unmodified protocol (free or lifted), and speed over all candidates.
 _CHART: Final = re.compile(r"^(lift_)?(?:(letter)(?=_low$|_high$|_count$|$)|raw(?=_end_to_end_per_second$))")
 
@@ -41,8 +40,9 @@ def has_old_names(document: bytes) -> bool:
 
 
 def convert_names(value: Any) -> Any:
+    """Convert the names of graspd 0.2 in a JSON value to present names."""
     if isinstance(value, dict):
-        # Options next to a method are the planner's own and are not renamed.
+        # The planner's own options, next to the method, are not renamed.
         own = {"options"} if "method" in value else set()
         found = {KEYS.get(key, key): inner if key in own else convert_names(inner) for key, inner in value.items()}
         for key, names in VALUES.items():
@@ -74,7 +74,7 @@ def _chart_name(name: str) -> str:
 
 
 def original_request(request: dict[str, Any]) -> dict[str, Any]:
-    """Return a request with the names of graspd 0.2: ids of jobs and shards are digests with these names."""
+    """Return a request with the names of graspd 0.2, which the digests of jobs and shards use."""
     found = {
         _OLD_KEYS.get(key, key): _OLD_VALUES[key].get(value, value) if key in _OLD_VALUES else value
         for key, value in request.items()
@@ -83,7 +83,7 @@ def original_request(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def message_for_revision(revision: int, stage: str, message: dict[str, Any]) -> dict[str, Any]:
-    """Convert a task message to the names of its revision: workers of 0.2 may run during an upgrade."""
+    """Convert a task message to the names of its stage's revision, for workers of 0.2 during an upgrade."""
     request = message.get("request")
     if not isinstance(request, dict) or not 0 < revision <= _REVISIONS.get(stage, 0):
         return message

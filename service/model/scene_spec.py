@@ -1,7 +1,4 @@
-"""Scenes: a kind, or supports, neighbours and the target's pose. The scene frame has z upwards.
-
-A support is a half-space (everything below a plane) or a box.
-"""
+"""Scenes: a kind, or supports, neighbours and pose of the target. In the scene frame, z points up."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationError,
 from graspd.service.model.base import Digest, Model, Name, error_text, first_error
 from graspd.service.model.errors import InputError, did_you_mean
 
-#: Kinds of scenes; `free`: a floating object, `file`: supports from a file.
+#: Kinds of scenes. `free`: a floating object; `file`: supports from a file.
 SceneKind = Literal["free", "table", "bin", "shelf", "file"]
 KINDS: Final = ("free", "table", "bin", "shelf")
 MOST_SUPPORTS: Final = 32
@@ -71,10 +68,8 @@ class Box(Model):
 
 class NeighbourSpec(Model):
     object: str = Field(min_length=1, max_length=1024)
-    """A built-in object or a mesh; in a scene file, relative paths start at the file's folder."""
-    pose: Pose | None = Field(
-        None, description="pose in the scene: x y z [m], unit quaternion w x y z; absent: dropped"
-    )
+    """A built-in object or a mesh file; relative paths in a scene file start at its folder."""
+    pose: Pose | None = Field(None, description="pose in the scene: x y z [m], unit quaternion w x y z; none: dropped")
     digest: Digest | None = Field(
         None, exclude_if=lambda value: value is None, description="digest of the object's files; set by the service"
     )
@@ -84,7 +79,7 @@ Supports = tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...]
 
 
 class SceneSpec(Model):
-    """Environment of the object: supports and neighbours."""
+    """Environment of the target object: supports and neighbours."""
 
     kind: SceneKind = "free"
     supports: Supports = Field((), max_length=MOST_SUPPORTS)
@@ -92,9 +87,8 @@ class SceneSpec(Model):
     """Pose of the object in the scene; None: drop onto the support below."""
     faces: Literal["drawn", "all"] = "drawn"
     """drawn: resting faces with their frequency after drops; all: one scene for each stable face."""
-
     touch: Touch = TOUCH
-    """Clearance of fingertips to supports [mm]: 2, as for the rest of the hand; 0: contact; negative: pressed in."""
+    """Clearance of fingertips to supports [mm]. 2: as for the rest of the hand; 0: contact; negative: pressed in."""
     neighbours: tuple[NeighbourSpec, ...] = Field((), max_length=MOST_NEIGHBOURS)
 
     @model_validator(mode="after")
@@ -113,7 +107,7 @@ class SceneSpec(Model):
         return self
 
     def to_attribute(self) -> dict[str, Any]:
-        """Return the scene for a shard's attribute; another attribute has the neighbours' digests."""
+        """Return the scene for a shard's attribute; another attribute has the digests of the neighbours."""
         return self.model_dump(mode="json", exclude={"neighbours": {"__all__": {"digest"}}})
 
     def _check_neighbours(self) -> None:
@@ -136,23 +130,19 @@ def parse_scene(
     """Parse a scene: one of `KINDS` or a file. `touch` replaces the file's value. InputError if invalid."""
     path = Path(text)
     if text not in KINDS and path.suffix.lower() not in SCENE_FILES:
-        meant = did_you_mean(text, KINDS)
-        raise InputError(
-            f"unknown scene {text!r}; choose one of {', '.join(KINDS)}, or give a JSON or YAML file{meant}"
-        )
+        hint = did_you_mean(text, KINDS)
+        raise InputError(f"unknown scene {text!r}; choose one of {', '.join(KINDS)}, or give a JSON or YAML file{hint}")
     found = SceneSpec(kind=text) if text in KINDS else read_scene(path)
-    touch = found.touch if touch is None else touch
-    if faces == found.faces and touch == found.touch and not beside:
-        return found
-    said = found.model_dump(exclude={"faces", "touch", "neighbours"})
-    others = [*(one.model_dump() for one in found.neighbours), *({"object": name} for name in beside)]
+    neighbours = [*found.neighbours, *({"object": name} for name in beside)]
+    changed = {"faces": faces, "touch": found.touch if touch is None else touch, "neighbours": neighbours}
     try:
-        return SceneSpec(**said, faces=faces, touch=touch, neighbours=others)
+        return SceneSpec(**{**dict(found), **changed})
     except ValidationError as error:
         raise InputError(f"scene {text}: {first_error(error)}") from None
 
 
 def read_scene(path: Path) -> SceneSpec:
+    """Read a scene file of at most `MAX_FILE_BYTES`; InputError if it is unreadable or invalid."""
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(f"the scene file {path} is larger than {MAX_FILE_BYTES // 1024} KiB")
@@ -165,14 +155,13 @@ def read_scene(path: Path) -> SceneSpec:
     try:
         spec = SceneSpec(**{"kind": "file", **found})
     except (ValidationError, TypeError) as error:
-        said = first_error(error) if isinstance(error, ValidationError) else str(error)
-        raise InputError(f"the scene file {path} is wrong: {said}") from None
-    files = [path.parent / one.object for one in spec.neighbours]
-    beside = tuple(
-        one.model_copy(update={"object": str(file)}) if file.is_file() else one
-        for one, file in zip(spec.neighbours, files, strict=True)
+        reason = first_error(error) if isinstance(error, ValidationError) else str(error)
+        raise InputError(f"the scene file {path} is wrong: {reason}") from None
+    neighbours = tuple(
+        one.model_copy(update={"object": str(file)}) if (file := path.parent / one.object).is_file() else one
+        for one in spec.neighbours
     )
-    return spec.model_copy(update={"neighbours": beside})
+    return spec.model_copy(update={"neighbours": neighbours})
 
 
 def _parse_document(text: str, path: Path) -> object:
@@ -192,7 +181,7 @@ def _parse_document(text: str, path: Path) -> object:
 BIN_SIZE: Final = (0.40, 0.30)
 BIN_HEIGHT: Final = 0.15
 WALL: Final = 0.02
-#: Width and depth of a shelf's boards, and the height between them [m]; the side towards -x is open.
+#: Width and depth of a shelf's boards, and the height between the boards [m]; the side towards -x is open.
 SHELF_SIZE: Final = (0.80, 0.35)
 SHELF_HEIGHT: Final = 0.35
 UPRIGHT: Final = 1 - 1e-6
@@ -209,6 +198,7 @@ def supports_in(spec: SceneSpec) -> tuple[HalfSpace | Box, ...]:
 
 
 def has_table(spec: SceneSpec) -> bool:
+    """Check whether a support is a level half-space."""
     flat = (one for one in supports_in(spec) if isinstance(one, HalfSpace))
     return any(one.normal[2] / math.hypot(*one.normal) > UPRIGHT for one in flat)
 
@@ -256,7 +246,7 @@ class SceneDocument(Model):
         min_length=1, max_length=MOST_SUPPORTS, description="supports around the object, in the scene frame, z up [m]"
     )
     target: Pose | None = Field(
-        None, description="pose of the object in the scene: x y z [m], unit quaternion w x y z; absent: dropped"
+        None, description="pose of the object in the scene: x y z [m], unit quaternion w x y z; none: dropped"
     )
     neighbours: tuple[NamedNeighbour, ...] = Field(
         (),
@@ -271,7 +261,7 @@ class SceneDocument(Model):
     )
 
 
-#: Scene in a request: a kind or a `SceneDocument`, discriminated so that errors refer to the intended form.
+#: Scene in a request: a kind or a `SceneDocument`, discriminated so that errors refer to the intended type.
 SceneOption = Annotated[
     Annotated[Literal["free", "table", "bin", "shelf"], Tag("kind")] | Annotated[SceneDocument, Tag("document")],
     Discriminator(lambda value: "document" if isinstance(value, dict | SceneDocument) else "kind"),
@@ -307,14 +297,17 @@ def check_object_name(text: str) -> str:
 def scene_option(
     text: str, *, beside: Path | None = None, named: Callable[[str], str] = check_object_name
 ) -> str | dict[str, Any]:
-    """Return a request's scene from a user's text; `named` maps neighbours in a file to service names."""
+    """Return the scene of a request: a kind, or the content of a scene file relative to folder `beside`.
+
+    `named` maps the neighbours of the file to names in the service.
+    """
     if text in KINDS:
         return text
     is_file = Path(text).suffix.lower() in SCENE_FILES
-    found = read_scene(Path(text) if beside is None else beside / text) if is_file else parse_scene(text)
-    said = found.model_dump(mode="json", include={"supports", "target", "neighbours"}, exclude_none=True)
+    found = read_scene((beside or Path()) / text) if is_file else parse_scene(text)
+    document = found.model_dump(mode="json", include={"supports", "target", "neighbours"}, exclude_none=True)
     if found.touch != TOUCH:
-        said["touch"] = found.touch
-    for one in said["neighbours"]:
+        document["touch"] = found.touch
+    for one in document["neighbours"]:
         one["object"] = named(one["object"])
-    return said if said["neighbours"] else {key: value for key, value in said.items() if key != "neighbours"}
+    return document if document["neighbours"] else {key: document[key] for key in document if key != "neighbours"}

@@ -1,4 +1,4 @@
-"""Definitions of all series of `/metrics`, and the names of their stored sums."""
+"""Definitions of all time series of `/metrics`, and names of the stored sums."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from pydantic_core import from_json
 
 STAGE_BUCKETS_S: Final = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 HTTP_BUCKETS_S: Final = (0.002, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)
+#: Labels of series of tasks.
+_TASK: Final = ("priority", "stage")
 
 
 @dataclass(frozen=True)
@@ -22,53 +24,27 @@ class Series:
 
 
 _ALL: Final = (
-    Series("graspd_queue_depth", "gauge", ("priority", "stage"), "waiting tasks", "queue"),
-    Series(
-        "graspd_queue_oldest_task_seconds", "gauge", ("priority", "stage"), "age of the oldest waiting task", "queue"
-    ),
-    Series("graspd_tasks_running", "gauge", ("priority", "stage"), "tasks that workers are running", "queue"),
-    Series(
-        "graspd_workers", "gauge", ("state",), "workers by state: checking, idle, busy, stopping, quarantined", "queue"
-    ),
-    Series(
-        "graspd_worker_lease_age_seconds",
-        "gauge",
-        ("worker", "device"),
-        "time since the worker's last heartbeat",
-        "queue",
-    ),
+    Series("graspd_queue_depth", "gauge", _TASK, "waiting tasks", "queue"),
+    Series("graspd_queue_oldest_task_seconds", "gauge", _TASK, "age of the oldest waiting task", "queue"),
+    Series("graspd_tasks_running", "gauge", _TASK, "tasks that workers are running", "queue"),
+    Series("graspd_workers", "gauge", ("state",), "workers: checking, idle, busy, stopping, quarantined", "queue"),
+    Series("graspd_worker_lease_age_seconds", "gauge", ("worker", "device"), "time since the last heartbeat", "queue"),
     Series("graspd_controller_up", "gauge", (), "1: a controller sent a heartbeat recently", "queue"),
     Series("graspd_jobs_unfinished", "gauge", ("state",), "queued and running jobs, counted up to 10,000", "index"),
     Series("graspd_job_oldest_seconds", "gauge", ("state",), "age of the oldest queued and running job", "index"),
     Series(
-        "graspd_grasps_per_second",
-        "gauge",
-        ("verdict",),
-        "grasps stored per second, mean of the last minute: all, valid",
-        "index",
+        "graspd_grasps_per_second", "gauge", ("verdict",), "stored grasps per second, last minute: all, valid", "index"
     ),
     Series("graspd_store_damaged", "gauge", (), "objects of the store known to be damaged or missing", "index"),
     Series("graspd_part_up", "gauge", ("part",), "1: the part (redis, index or store) responds", "probe"),
+    Series("graspd_part_latency_seconds", "gauge", ("part",), "response time of a ping, read or small write", "probe"),
     Series(
-        "graspd_part_latency_seconds",
-        "gauge",
-        ("part",),
-        "response time of the part: a ping, a read or a small write",
-        "probe",
-    ),
-    Series(
-        "graspd_grasps_total",
-        "counter",
-        ("verdict",),
-        "grasps stored (all, valid), candidates tested (validated)",
-        "controller",
+        "graspd_grasps_total", "counter", ("verdict",), "grasps: all, valid; tested candidates: validated", "controller"
     ),
     Series("graspd_shards_total", "counter", ("stage",), "shards written", "controller"),
     Series("graspd_shard_bytes_total", "counter", ("stage",), "bytes of the shards written", "controller"),
     Series("graspd_stage_seconds", "histogram", ("stage",), "duration of one task on a worker", "controller"),
-    Series(
-        "graspd_task_failures_total", "counter", ("stage", "kind"), "failed attempts by name of the error", "controller"
-    ),
+    Series("graspd_task_failures_total", "counter", ("stage", "kind"), "failed attempts by error", "controller"),
     Series(
         "graspd_task_handbacks_total",
         "counter",
@@ -76,9 +52,7 @@ _ALL: Final = (
         "unfinished tasks that workers gave back: deferred, returned, cancelled",
         "controller",
     ),
-    Series(
-        "graspd_jobs_ended_total", "counter", ("state",), "jobs that succeeded, failed or were cancelled", "controller"
-    ),
+    Series("graspd_jobs_ended_total", "counter", ("state",), "finished jobs by final state", "controller"),
     Series("graspd_http_requests_total", "counter", ("method", "route", "status"), "HTTP requests answered", "process"),
     Series("graspd_http_request_seconds", "histogram", ("method", "route"), "response time", "process"),
 )

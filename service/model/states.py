@@ -20,7 +20,7 @@ class State(StrEnum):
 
 
 class Stage(StrEnum):
-    """Stage of a task. `ingest` checks uploads; other stages make shards."""
+    """Stage of a task. `ingest` checks uploads; the other stages make shards."""
 
     INGEST = "ingest"
     SYNTHESIZE = "synthesize"

@@ -1,9 +1,10 @@
-"""Records of studies: stability maps, and keys of charts of speed against accuracy."""
+"""Records of studies: stability maps; names of accuracies and speeds in charts."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any, Final, Literal
@@ -14,7 +15,7 @@ from graspd.service.model.base import json_value
 
 Outcome = Literal["good", "weak", "broken", "refused"]
 
-#: Outcomes from best to worst; `refused`: a check rejected the input before the computation.
+#: Outcomes from best to worst. `refused`: a check rejected the input before the computation.
 OUTCOMES: Final[tuple[Outcome, ...]] = ("good", "weak", "broken", "refused")
 _Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 
@@ -71,18 +72,20 @@ class StabilityMap:
 
     @property
     def is_divided(self) -> bool:
+        """Whether jobs can reach some cells, but not all."""
         return 0 < len(self.reached()) < len(self.cells)
 
     def still_breaks(self) -> list[str]:
+        """Return a line per panel with broken cells that jobs can reach: `PANEL X, X (Y, Y); ...`."""
         lines = []
         for panel in self.panels:
-            by_x: dict[float | str, list[str]] = {}
+            by_x: dict[float | str, list[str]] = defaultdict(list)
             for cell in self.of(panel):
                 if cell.reached and cell.outcome == "broken":
-                    by_x.setdefault(cell.x, []).append(format_tick(cell.y))
-            by_y: dict[str, list[str]] = {}
+                    by_x[cell.x].append(format_tick(cell.y))
+            by_y: dict[str, list[str]] = defaultdict(list)
             for x, ys in by_x.items():
-                by_y.setdefault(", ".join(ys), []).append(format_tick(x))
+                by_y[", ".join(ys)].append(format_tick(x))
             if by_y:
                 lines.append(f"{panel} " + "; ".join(f"{', '.join(xs)} ({ys})" for ys, xs in by_y.items()))
         return lines
@@ -96,7 +99,7 @@ class Stability:
     maps: list[StabilityMap]
 
     def as_json(self) -> dict[str, Any]:
-        """Return a JSON object with None for numbers that JSON lacks; `from_json` reads None as nan."""
+        """Return a JSON object; None replaces nan and infinity, and `from_json` reads None as nan."""
         return dict(json_value(asdict(self)))
 
 
@@ -107,11 +110,7 @@ def from_json(record: Mapping[str, Any]) -> Stability:
 
 def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
     """Return indices of points that no other point dominates; more is better in both coordinates."""
-    return {
-        index
-        for index, (x, y) in enumerate(points)
-        if not any((a >= x and b >= y) and (a > x or b > y) for a, b in points)
-    }
+    return {i for i, (x, y) in enumerate(points) if not any(a >= x and b >= y and (a, b) != (x, y) for a, b in points)}
 
 
 def count_outcomes(cells: Iterable[MapCell]) -> dict[Outcome, int]:
@@ -120,7 +119,7 @@ def count_outcomes(cells: Iterable[MapCell]) -> dict[Outcome, int]:
 
 
 def grade(value: float, weak: float, broken: float) -> Outcome:
-    if not value < broken:  # True for nan too.
+    if not value < broken:  # Also true for nan.
         return "broken"
     return "good" if value < weak else "weak"
 
@@ -146,7 +145,7 @@ def format_tick(value: float | str) -> str:
 
 
 def tick_position(ticks: Sequence[Any], value: float) -> float:
-    """Return a value's position on logarithmic ticks, in steps from the first, extrapolated beyond them."""
+    """Return a value's position on logarithmic ticks, in steps from the first; extrapolate beyond them."""
     logs, at = [math.log(tick) for tick in ticks], math.log(value)
     if len(logs) < 2:
         return 0.0
@@ -155,24 +154,22 @@ def tick_position(ticks: Sequence[Any], value: float) -> float:
 
 
 def _exponent(text: str) -> str:
-    """Shorten an exponent (1e-05 to 1e-5), or use an exponent if the result is shorter."""
+    """Shorten an exponent (1e-05 to 1e-5); for a number without an exponent, write one if it is shorter."""
+    mantissa, exponent = (text if "e" in text else f"{float(text):e}").split("e")
     if "e" not in text:
-        digits = f"{float(text):e}".split("e")
-        shorter = f"{digits[0].rstrip('0').rstrip('.')}e{int(digits[1])}"
-        return min(text, shorter, key=len)
-    mantissa, exponent = text.split("e")
+        return min(text, f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}", key=len)
     return f"{mantissa}e{int(exponent)}"
 
 
 _RECORD: Final = TypeAdapter(Stability)
 
-#: Modes of the rows in charts of scenes: planned in the scene, or planned around a free object and filtered.
+#: Modes of rows in charts of scenes: planned in the scene, or planned around a free object and filtered.
 IN_SCENE: Final = "in the scene"
 FILTERED: Final = "free, filtered"
 
-#: Accuracies that a target can have, and whether more is better: for free objects, and in scenes.
+#: Accuracies of targets, with a flag for "more is better": for free objects, and in scenes.
 FREE: Final = {"gsr": True, "dexgraspbench": True, "hard": True, "robust": True, "epsilon": True, "pd_mm": False}
 IN_SCENES: Final = {"lift": True, "lift_dexgraspbench": True, "lift_hard": True, "robust": True}
 
-#: Speeds: end to end, and of the planner alone; charts of graspd 0.1 have only the latter.
+#: Speeds: end to end, and of the planner alone; charts of graspd 0.1 have only the speed of the planner.
 SPEEDS: Final = ("end_to_end_per_second", "valid_per_second")

@@ -55,7 +55,7 @@ def quat_from_axis_angle(axis: Floats, angle: Floats) -> Floats:
 
 
 def slerp(a: Floats, b: Floats, share: float) -> Floats:
-    """Interpolate unit quaternions (4,) from a to b by `share` at constant rate along the shorter arc."""
+    """Interpolate unit quaternions (4,) from `a` (share 0) to `b` (share 1) along the shorter arc."""
     a, b = np.asarray(a, float), np.asarray(b, float)
     cosine = float(a @ b)
     b, cosine = (-b, -cosine) if cosine < 0 else (b, cosine)
@@ -116,7 +116,7 @@ def pose_to_matrix(pose: Floats) -> Floats:
 
 
 def compose(a: Floats, b: Floats) -> Floats:
-    """Compose poses (..., 7): express `b`, given in the frame of `a`, in the parent frame of `a`."""
+    """Return pose `b` (..., 7), given in the frame of pose `a` (..., 7), in the parent frame of `a`."""
     a, b = np.asarray(a, float), np.asarray(b, float)
     position = a[..., :3] + quat_rotate(a[..., 3:], b[..., :3])
     rotation = quat_multiply(a[..., 3:], b[..., 3:])
@@ -131,13 +131,13 @@ def invert(pose: Floats) -> Floats:
 
 
 def apply(pose: Floats, points: Floats) -> Floats:
-    """Transform points (..., 3) of a frame to its parent: rotation, then translation."""
+    """Transform points (..., 3) from the frame of a pose (..., 7) to the parent frame."""
     p = np.asarray(pose, float)
     return quat_rotate(p[..., 3:], points) + p[..., :3]
 
 
 def spread_directions(count: int) -> Floats:
-    """Return (count, 3) unit vectors on a golden spiral, evenly spread."""
+    """Return evenly spread unit vectors (count, 3) on a golden spiral."""
     k = np.arange(count)
     z = 1 - (2 * k + 1) / count
     turn, across = np.pi * (3 - np.sqrt(5)) * k, np.sqrt(1 - z**2)

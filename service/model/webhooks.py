@@ -19,12 +19,12 @@ MAX_URL: Final = 500
 MOST_HOOKS: Final = 20
 MOST_WAITING: Final = 1000
 SIGNATURE: Final = "X-Graspd-Signature"
-#: Delays before the second and later attempts [s]; if the last attempt fails, the delivery has failed.
+#: Delays before the second and later attempts [s]; after them a delivery counts as failed.
 WAITS_S: Final = (5.0, 30.0, 120.0, 600.0, 3600.0, 6 * 3600.0)
 
 
 class Webhook(Record):
-    """`webhooks/{id}.json`: a URL and the final states to report to it; `secret_of` derives the secret."""
+    """`webhooks/{id}.json`: a URL and the final states of jobs and datasets to report."""
 
     version: Literal[1] = 1
     id: Digest
@@ -36,7 +36,7 @@ class Webhook(Record):
 
 
 def check_url(url: str) -> str:
-    """Return the URL; InputError unless its scheme is http or https, with a host and without a user."""
+    """Return the URL; InputError unless it has scheme http or https, a host, no user, and is plain ASCII."""
     try:
         parts = urlsplit(url)
         host, _ = parts.hostname, parts.port
@@ -50,7 +50,7 @@ def check_url(url: str) -> str:
 
 
 def secret_of(master: str, webhook: str) -> str:
-    """Return the secret that signs a webhook's bodies; it is derived from `master`, never stored."""
+    """Derive the secret that signs the bodies of a webhook from the secret `master`."""
     return "whsec_" + hmac.new(master.encode(), f"webhook {webhook}".encode(), hashlib.sha256).hexdigest()
 
 

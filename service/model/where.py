@@ -5,9 +5,9 @@
     factor       not factor | ( expression ) | NAME | NAME op VALUE
     op           < <= > >= = == !=
 
-Metrics are compared with numbers; `hand`, `object` and `type` with words; flags need no comparison. Comparisons with a
-missing number are false. The text is parsed to a tree and never evaluated as code. `service.readers.where` applies the
-tree to base shards, `service.index.queries.grasps` to the index.
+Metrics are compared with numbers; `hand`, `object` and `type` with words; flags stand alone. Comparisons with a missing
+number are false. The text is parsed to a tree and never executed. `service.readers.where` evaluates the tree on base
+shards, `service.index.queries.grasps` on the index.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SHORT: Final = {"robust": "robust_share"}
 _WORDS: Final = ("hand", "object", "type")
 _TYPES: Final = tuple(kind.name.lower() for kind in GraspType)
 FLAGS: Final = ("validated", "valid", "feasible", "held", "lift", "lift_hard")
-_COMPARISONS: Final = {"<": "<", "<=": "<=", ">": ">", ">=": ">=", "=": "=", "==": "=", "!=": "!="}
+_COMPARISONS: Final = {**{op: op for op in ("<", "<=", ">", ">=", "=", "!=")}, "==": "="}
 _TOKEN: Final = re.compile(
     r"\s*(?:(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?![\w.])|(?P<op><=|>=|==|!=|[<>=()])"
     r"|'(?P<quoted>[^']*)'|(?P<word>[A-Za-z0-9_][\w.\-]*))"
@@ -78,15 +78,13 @@ Node = Flag | MetricComparison | WordComparison | TypeComparison | Negation | Co
 
 
 def parse_where(text: str) -> Node:
-    """Parse an expression to its tree; InputError quotes the mistake, or lists the known names."""
+    """Parse an expression to a tree; InputError quotes the mistake or lists the known names."""
     if len(text) > LONGEST:
         raise InputError(f"the expression is {len(text)} characters long; at most {LONGEST} are allowed")
     parser = _Parser(_tokens(text))
     found = parser.expression(0)
-    if parser.at < len(parser.tokens):
-        raise InputError(
-            f"{parser.tokens[parser.at].text!r} follows a complete expression; join conditions by `and` or `or`"
-        )
+    if rest := parser.tokens[parser.at :]:
+        raise InputError(f"{rest[0].text!r} follows a complete expression; join conditions by `and` or `or`")
     return found
 
 
@@ -138,19 +136,19 @@ class _Parser:
         name = _SHORT.get(token.text, token.text)
         if token.kind != "word" or token.text in ("and", "or"):
             raise InputError(f"{token.text!r} was found where a name is expected")
-        following = self.tokens[self.at] if self.at < len(self.tokens) else None
-        compared = following is not None and following.kind == "op" and following.text in _COMPARISONS
+        following = self.tokens[self.at] if self.at < len(self.tokens) else _Token("end", "")
+        op = _COMPARISONS.get(following.text) if following.kind == "op" else None
         if name in FLAGS:
-            if compared:
+            if op:
                 raise InputError(f"{name} is a flag: write `{name}` or `not {name}`")
             return Flag(name)
         if name not in _METRICS and name not in _WORDS:
             known = [*_METRICS, *FLAGS, *_WORDS]
             raise InputError(f"there is no {token.text!r}; the names are {choices_text(token.text, known)}")
-        if not compared or following is None:
+        if op is None:
             raise InputError(f"{name} needs a comparison, such as `{name} {'= power' if name == 'type' else '> 0'}`")
         self.at += 1
-        op, value = _COMPARISONS[following.text], self._next("a value")
+        value = self._next("a value")
         if name in _WORDS:
             return _word_comparison(name, op, value)
         if value.kind != "number":
@@ -158,10 +156,9 @@ class _Parser:
         return MetricComparison(name, op, float(value.text))
 
     def _accept(self, kind: str, text: str) -> bool:
-        if self.at < len(self.tokens) and self.tokens[self.at] == _Token(kind, text):
-            self.at += 1
-            return True
-        return False
+        is_next = self.tokens[self.at : self.at + 1] == [_Token(kind, text)]
+        self.at += is_next
+        return is_next
 
     def _next(self, wanted: str) -> _Token:
         if self.at >= len(self.tokens):

@@ -1,4 +1,4 @@
-"""Store, index and queue of a process. `record_transaction` writes records and index rows together."""
+"""Store, index and queue of a process, and transactions that write records and index rows together."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class Services:
 
     @classmethod
     def open(cls, settings: Settings, *, patience: int = 3, make: bool = True, anew: bool = False) -> Self:
-        """Open all three; create the data folder and the index. Redis need not answer yet.
+        """Open store, index and queue; create the data folder and the index. Redis need not answer yet.
 
-        `patience` is the number of attempts to reach Redis. `make` creates a missing store folder (else NotFoundError);
-        `anew` empties an index of another revision.
+        `patience`: attempts per Redis command. Without `make`, NotFoundError for a missing store folder. `anew` empties
+        an index of another revision.
         """
         from graspd.service.index.index import Index
         from graspd.service.queue.rq_queue import open_queue
@@ -54,15 +54,15 @@ class Services:
 
 @contextmanager
 def record_transaction(services: Services, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
-    """Yield an index transaction and a function to store records; a failure deletes them and keys `made`.
+    """Yield an index transaction and a function to store records; an error deletes them and keys `made`.
 
-    No other process writes to the index meanwhile, so checks before a record still hold when its rows are written.
+    No other process can write to the index during the transaction, so a check at its beginning still holds at its end.
     """
     keys = list(made)
 
     def put(key: str, record: BaseModel) -> bool:
-        is_new = put_record(services.store, key, record)
-        keys.extend([key] if is_new else [])
+        if is_new := put_record(services.store, key, record):
+            keys.append(key)
         return is_new
 
     with services.index.database.write_transaction() as connection:
@@ -75,5 +75,5 @@ def record_transaction(services: Services, made: Sequence[str] = ()) -> Iterator
                 try:
                     services.store.delete(key)
                 except StoreUnavailable as error:
-                    log.error("%s stays in the store though its request was refused: %s", key, error)
+                    log.error("%s remains in the store although its request failed: %s", key, error)
             raise

@@ -1,7 +1,6 @@
 """Controller: one loop for all work outside workers. After a kill, another controller continues.
 
-A round writes events to the index, and queues unfinished tasks of the index that the queue lacks. One controller leads;
-the others stand by (`service.pipeline.leading`).
+A round indexes events and queues missing tasks. One controller leads, and the others wait (`service.pipeline.leading`).
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Final
 
 from graspd.service.index.notes import StoreMark
@@ -40,23 +40,23 @@ from graspd.service.store.records import newest_mark, next_mark, read_record, se
 from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
-#: Maximum number of events of one round, about one second of work. The next round follows at once.
+#: Maximum number of events of one round, which takes about a second. The next round follows at once.
 _EVENTS_A_ROUND: Final = 2000
-#: Maximum number of events that may wait for the store; above this, no more are read from the stream.
+#: Number of events that wait for the store above which no more are read from the stream.
 _LONGEST_BACKLOG: Final = 10_000
 _FORGET_WORKERS_AFTER_S: Final = 3600.0
 _WORKERS_EVERY_S: Final = 2.0
-#: Validity of a worker's capabilities after its last registration [s].
+#: Time [s] for which the capabilities of a silent worker still count.
 _REMEMBERED_S: Final = 60.0
-#: Interval at which progress of tasks is published, equal to the polling interval of pages [s].
+#: Interval [s] at which progress of tasks is written to the index: the polling interval of pages.
 _PROGRESS_EVERY_S: Final = 0.5
 _LONGEST_PAUSE_S: Final = 5.0
 _COLLECT_EVERY_S: Final = 5.0
 #: Interval of the check that store and index still belong to this service.
 _IDENTIFY_EVERY_S: Final = 30.0
-#: Longest wait [s] for a running read of the store after a stop.
+#: Maximum time [s] to wait for background threads after a stop.
 _LAST_READ_S: Final = 3.0
-#: Least wait between two parts of large jobs [s]: longer than the sleep of a writer that waits for SQLite.
+#: Minimum pause [s] between two parts of large jobs: longer than the sleep of a writer that waits for SQLite.
 _ENTERING_GAP_S: Final = 0.15
 
 
@@ -94,11 +94,11 @@ class Controller:
             PeriodicDuty(clock, self._mark, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._indexer.flush, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._check_workers, _WORKERS_EVERY_S, share=0.1),
-            # A lease is checked three times before it counts as lost.
+            # Each lease is checked at least three times before it counts as lost.
             PeriodicDuty(clock, self._reconcile_queue, interval_s, longest_s=services.settings.lease_s / 3),
             PeriodicDuty(clock, self._feed_new, 0.0),
             PeriodicDuty(clock, self._publish_progress, min(_PROGRESS_EVERY_S, interval_s), share=0.1),
-            # The index is free for at least as long as it was locked.
+            # The index is unlocked for at least as long as it was locked.
             PeriodicDuty(clock, self._enter_large_job, _ENTERING_GAP_S, share=0.5),
             PeriodicDuty(clock, self._plan, interval_s),
             PeriodicDuty(clock, lambda: self._garbage.advance() or self._garbage.collect(), _COLLECT_EVERY_S),
@@ -111,7 +111,7 @@ class Controller:
 
     @contextmanager
     def _background_duties(self, stop: threading.Event) -> Iterator[None]:
-        """Run webhooks, and the integrity scan if enabled, in parallel with the rounds."""
+        """Deliver webhooks, and run the integrity scan if enabled, in threads beside the rounds."""
         duties = {"webhooks": WebhookDispatcher(self._services, stop).run}
         if self._services.settings.integrity_scan_mb_per_s:
             duties["integrity scan"] = IntegrityScan(self._services, stop).run
@@ -128,13 +128,13 @@ class Controller:
     def _run(self, stop: threading.Event) -> None:
         pause = 0.0
         while not stop.is_set():
-            # The heartbeat goes on while a backend is unavailable: a restarted controller would wait just as long.
+            # The heartbeat continues while a backend is unavailable, because a restart would not help.
             self._alive.touch()
             try:
                 self.round(wait_s=self._services.settings.controller_interval_s)
                 pause = 0.0
             except BusyError:
-                raise  # Another service has taken over the store; further rounds would undo its work.
+                raise  # Another service has taken over the store.
             except UnavailableError as error:
                 pause = min(_LONGEST_PAUSE_S, max(0.25, 2 * pause))
                 log.warning("%s; the controller tries again in %.2g s", error, pause)
@@ -148,7 +148,7 @@ class Controller:
                 self._mark()
 
     def round(self, *, wait_s: float = 0.0) -> None:
-        """Index new events, then check queue, leases and workers; BusyError if another service took the store."""
+        """Index new events, then run due duties; BusyError if another service has taken over the store."""
         self._identify()
         self._ensure_index()
         away: list[UnavailableError] = []
@@ -161,7 +161,7 @@ class Controller:
             raise away[0]
 
     def _mark(self) -> None:
-        """Renew the mark of index and store after changes, to detect and rebuild an older copy of the index."""
+        """After changes, give index and store a new common mark, by which an older copy of either is detected."""
         notes = self._services.index.notes
         present, changes = notes.store_mark(), notes.changes()
         if changes != present.changes or self._made:
@@ -172,7 +172,7 @@ class Controller:
             self._known, self._made = fresh, False
 
     def _publish_progress(self) -> None:
-        """Write changed progress of tasks, from the reports of workers, to the index."""
+        """Write progress of tasks that workers report to the index, if it has changed."""
         busy = (beat for beat in self._services.queue.workers() if beat.task_id)
         found = {beat.task_id: (beat.done, beat.total, beat.message) for beat in busy}
         if changed := {task: one for task, one in found.items() if self._progress.get(task) != one}:
@@ -184,10 +184,7 @@ class Controller:
         return self._has_plans
 
     def _enter_large_job(self) -> None:
-        """Enter the next tasks of a job too large for one transaction; other writers can run in between.
-
-        Such jobs alternate. A note in the index stores the position, so another controller can continue.
-        """
+        """Enter the next tasks of a job too large for one transaction; such jobs take turns."""
         if not (jobs := self._services.index.write.partly_entered_jobs()):
             return
         self._entered = next((job for job in jobs if job > self._entered), jobs[0])
@@ -200,24 +197,21 @@ class Controller:
 
     def _check_workers(self) -> None:
         self._announce()
-        # A worker that ends is unregistered a moment before it reports this: it does not count as lost at once.
         present = self._services.queue.workers()
         self._workers = len(present)
-        # A briefly silent worker still counts in the decision whether tasks are held back.
+        # The capabilities of a briefly silent worker still count, so that its tasks are not held back.
         now = self._clock()
         self._seen |= {beat.name: (now, beat) for beat in present}
         self._seen = {name: one for name, one in self._seen.items() if now - one[0] < _REMEMBERED_S}
         known = [beat for _, beat in self._seen.values()]
         self._routes = Routes(known)
         self._services.queue.clear_untaken(known)
-        self._services.index.live.set_workers(
-            present,
-            lost_before=timestamp(self._services.settings.lease_s),
-            forget_before=timestamp(_FORGET_WORKERS_AFTER_S),
-        )
+        # A worker that ends is unregistered shortly before its event arrives: only a longer silence means a loss.
+        lost, forgotten = timestamp(self._services.settings.lease_s), timestamp(_FORGET_WORKERS_AFTER_S)
+        self._services.index.live.set_workers(present, lost_before=lost, forget_before=forgotten)
 
     def _ensure_index(self) -> None:
-        """Ensure that the index is complete before events are applied, because it may be lost at any time."""
+        """Ensure that the index is complete before events are applied; it may be lost at any time."""
         if not self._started:
             self._start()
         elif self._services.index.notes.completeness() is None or self._is_stale():
@@ -230,7 +224,7 @@ class Controller:
             self._indexer.index_shard(manifest)
         complete_if_new(self._services.index, self._services.store)
         made = self._services.index.notes.completeness()
-        # Omitted records may be repaired by now.
+        # Records that an earlier rebuild omitted may have been repaired.
         if made is None or made.left_out or self._is_stale():
             self._rebuild_index()
         else:
@@ -238,9 +232,9 @@ class Controller:
         self._started = True
 
     def _is_stale(self) -> bool:
-        """Return whether index or store was replaced by an older copy."""
+        """Return whether index or store was replaced by an older copy; if so, mark the index as incomplete."""
         present = self._services.index.notes.store_mark()
-        # A kill between the two writes leaves the previous mark in the store.
+        # After a kill between the writes of `_mark`, the store has the previous mark.
         if present.mark == self._known or newest_mark(self._services.store) in (present.mark, present.before):
             self._known = present.mark
             return False
@@ -260,18 +254,18 @@ class Controller:
                 log.warning("%s", error)
 
     def _index_events(self, wait_s: float) -> None:
-        """Apply new events; events that need the store wait while it is unavailable."""
+        """Apply new events; events that need an unavailable store wait in the backlog."""
         if len(self._backlog) < _LONGEST_BACKLOG:
-            wait_s = wait_s if not self._backlog else 0.0
+            wait_s = 0.0 if self._backlog else wait_s
             self._backlog += self._services.queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s)
         if not self._backlog:
             return
         waiting = set(self._indexer.apply([event for _, event in self._backlog]))
         done = [entry for place, entry in enumerate(self._backlog) if place not in waiting]
-        self._backlog = [entry for place, entry in enumerate(self._backlog) if place in waiting]
+        self._backlog = [self._backlog[place] for place in sorted(waiting)]
         self._services.queue.acknowledge([event_id for event_id, _ in done])
-        self._has_news |= (made := any(event.kind is not EventKind.JOB for _, event in done))
-        self._made |= made
+        if any(event.kind is not EventKind.JOB for _, event in done):
+            self._has_news = self._made = True
         if waiting:
             raise StoreUnavailable(f"the store does not answer, and {len(waiting)} events wait for it")
 
@@ -279,10 +273,9 @@ class Controller:
         self._services.queue.announce(PART, 5 * self._services.settings.controller_interval_s + 5)
 
     def _reconcile_queue(self) -> None:
-        # If Redis is readable but not writable, as on a full disk, no worker can send a heartbeat. This call then fails
-        # first, and no worker counts as lost.
+        # While Redis refuses writes, workers cannot send heartbeats: this write fails first, so none counts as lost.
         self._announce()
-        # Waiting tasks are read before leases, so that a task taken in between counts as leased.
+        # Waiting tasks are read before leases: a task that is taken in between then counts as leased.
         waiting = self._services.queue.waiting()
         leases = self._services.queue.leases()
         lost = self._reaper.reap(leases)
@@ -291,21 +284,19 @@ class Controller:
             self._services.queue.discard(stray)
         missing = {*self._reaper.find_missing(present), *(lease.task_id for lease in lost)}
         self._feed(present, missing)
-        self._has_news = False
 
     def _feed_new(self) -> None:
         if self._has_news:
             self._feed()
-            self._has_news = False
 
     def _feed(self, present: set[str] | None = None, missing: Collection[str] = ()) -> None:
-        """Queue ready tasks; without the queue's content (`present`), the marks of the index decide.
+        """Queue ready tasks that are not in `present`, the queue's content (None: use the index's marks).
 
-        The queue refuses a second entry of a task, even from a concurrent request, except for `missing` tasks.
+        The queue refuses a second entry of a task, except of `missing` tasks.
         """
         depths = self._services.queue.depths()
         now = time.time()
-        # Two tasks per worker, so that a worker that ends a task finds another one waiting.
+        # At least two tasks per worker, so that a worker never waits for its next task.
         window = max(self._services.settings.queue_window, 2 * self._workers)
         held: set[str] = set()
         for priority in Priority:
@@ -314,7 +305,7 @@ class Controller:
             if present is None:
                 held |= queue_tasks(self._services, ready, routes=self._routes)
                 continue
-            # After a rebuild the index has no marks of queued tasks.
+            # A rebuilt index lacks the marks of queued tasks.
             self._services.index.live.set_queued([task.task.id for task in ready if task.task.id in present])
             left = [task for task in ready if task.task.id not in present]
             for again in (False, True):
@@ -324,6 +315,7 @@ class Controller:
             log.warning("tasks are %s", why)
         self._held = held
         self._feed_checks(present, missing, now)
+        self._has_news = False
 
     def _feed_checks(self, present: set[str] | None, missing: Collection[str], now: float) -> None:
         for check in self._services.index.feed.ready_checks(now=now, limit=self._services.settings.queue_window):
@@ -353,31 +345,26 @@ def _log_failures(away: list[UnavailableError]) -> Iterator[None]:
         log.warning("%s", error)
 
 
+@dataclass
 class PeriodicDuty:
-    """Duty called in each round: runs at most once per `every_s`, and for at most `share` of the time.
+    """Work of a round that runs at most once per `every_s` [s] and for at most `share` of the time.
 
-    The duty also runs in the next round after an error, or after a result True, which means that work is left.
+    After an error, or a result True (work is left), the work runs again in the next round.
     """
 
-    def __init__(
-        self,
-        clock: Callable[[], float],
-        work: Callable[[], object],
-        every_s: float,
-        *,
-        share: float = 0.2,
-        longest_s: float = math.inf,
-    ) -> None:
-        """`longest_s` [s] is the longest pause, regardless of `share`."""
-        self._clock, self._work = clock, work
-        self._every_s, self._share, self._longest_s = every_s, share, longest_s
-        self._again = -math.inf
+    clock: Callable[[], float]
+    work: Callable[[], object]
+    every_s: float
+    share: float = 0.2
+    longest_s: float = math.inf
+    """Limit [s] of the pause that follows from `share`."""
+    due: float = -math.inf
 
     def __call__(self) -> None:
-        begun = self._clock()
-        if begun < self._again:
+        begun = self.clock()
+        if begun < self.due:
             return
-        is_left = self._work() is True
-        ended = self._clock()
-        pause = max(self._every_s, (ended - begun) * (1 / self._share - 1))
-        self._again = ended if is_left else ended + min(pause, max(self._every_s, self._longest_s))
+        is_left = self.work() is True
+        ended = self.clock()
+        pause = max(self.every_s, (ended - begun) * (1 / self.share - 1))
+        self.due = ended if is_left else ended + min(pause, max(self.every_s, self.longest_s))

@@ -1,9 +1,9 @@
 """Deletion of assets, jobs and datasets by users, and the garbage collector of the store.
 
-One step under the index's write lock writes `deletions/{what}/{id}.json` and removes the rows. From then on the
-resource does not exist: rebuilds omit it, and requests with its id are refused. In later rounds of the controller, the
-garbage collector moves its stored objects aside, then removes that record; it can resume after a kill. After the grace
-time, it permanently removes these stored objects and the shards that no job needs.
+A deletion writes `deletions/{what}/{id}.json` and removes the rows in one transaction. The resource then no longer
+exists: rebuilds omit it, and requests with its id are refused. The garbage collector of the controller then moves the
+stored objects below `removed/` and deletes that record. After the grace time it deletes these objects, and the shards
+that no job needs. It can resume after a kill.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from sqlalchemy import Connection
 
@@ -54,7 +54,7 @@ _AT_ONCE: Final = 200
 def delete_asset(
     services: Services, kind: AssetKind, name: str, *, owner: str = "", scope: ProjectScope = EVERYTHING
 ) -> None:
-    """Delete a hand, object or network; `scope` restricts what an error message names.
+    """Delete a hand, object or network; error messages name only resources in `scope`.
 
     ConflictError: the asset is built in, or a job, a dataset or a set of objects needs it.
     """
@@ -66,30 +66,29 @@ def delete_asset(
             if asset.shared and not scope.everything:
                 user = "a job, a dataset or a set of objects"
             raise ConflictError(f"the {kind.value} {asset.name!r} is needed by {user}; delete that first")
-        said = {"name": asset.name, "submitter": asset.owner, "project": asset.project}
-        _put(put, Deletion(what=kind.value, id=asset.digest, at=timestamp(), owner=owner, **said))
+        about = {"name": asset.name, "submitter": asset.owner, "project": asset.project}
+        _put(put, what=kind.value, id=asset.digest, owner=owner, **about)
         services.index.removals.remove_asset(kind, asset.digest, within=connection)
 
 
 def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
-    """Delete a job, and later the shards that only it needs; ConflictError if unfinished or in a dataset."""
+    """Delete a job, and later the shards only it needs; ConflictError: unfinished or in a dataset."""
     job = services.index.jobs.get(job_id)
     try:
         record = read_record(JobRecord, services.store, names.job_record_key(job_id))
     except (NotFoundError, DamagedError):
-        record = None  # Shards of an unreadable record are unknown, and stay.
+        record = None  # The shards of an unreadable record are unknown, so they stay.
     with record_transaction(services) as (connection, put):
         if user := services.index.removals.reason_to_keep_job(job_id, within=connection):
             raise ConflictError(f"job {job_id} {user}")
         attempts = services.index.removals.attempts_of(job_id, within=connection)
-        said = {"name": f"{job.request.hand} on {job.request.object}", "submitter": job.owner, "project": job.project}
-        deletion = Deletion(what="job", id=job_id, at=timestamp(), owner=owner, job=record, attempts=attempts, **said)
-        _put(put, deletion)
+        about = {"name": f"{job.request.hand} on {job.request.object}", "submitter": job.owner, "project": job.project}
+        _put(put, what="job", id=job_id, owner=owner, job=record, attempts=attempts, **about)
         services.index.removals.remove_job(job_id, within=connection)
 
 
 def delete_dataset(services: Services, name: str, *, owner: str = "", with_snapshots: bool = False) -> None:
-    """Delete a dataset and jobs for it alone; ConflictError if unfinished, or for unconfirmed snapshots."""
+    """Delete a dataset and the jobs that only it needs; ConflictError: it is unfinished or has snapshots."""
     dataset = services.index.datasets.get(name)
     if not dataset.state.is_final:
         raise ConflictError(f"dataset {name!r} is {dataset.state}; cancel it first: graspd datasets cancel {name}")
@@ -100,13 +99,12 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
                 f"dataset {name!r} has {taken} snapshot{'s' * (taken > 1)}, which papers and training runs may name; "
                 f"to delete them too: graspd datasets delete {name} --with-snapshots"
             )
-        said = {"submitter": dataset.owner, "project": dataset.project}
-        _put(put, Deletion(what="dataset", id=name, at=timestamp(), owner=owner, **said))
+        _put(put, what="dataset", id=name, owner=owner, submitter=dataset.owner, project=dataset.project)
         services.index.removals.remove_dataset(name, within=connection)
 
 
 def move_to_removed(services: Services, deletion: Deletion) -> None:
-    """Move a deleted resource below `removed/`, its record last, unless it was restored."""
+    """Move a deleted resource's stored objects below `removed/`, record last, unless it was restored."""
     record = _record_of(deletion)
     with services.index.database.write_transaction():
         if not services.store.exists(names.deletion_key(deletion.what, deletion.id)):
@@ -129,10 +127,10 @@ def restore(
     permit: Callable[[Deletion], None],
     among: Callable[[Deletion], bool] = lambda _: True,
 ) -> Deletion:
-    """Restore a deleted resource unchanged, by name or id; a dataset is restored with its deleted jobs.
+    """Restore a deleted resource by name or id; a dataset is restored with its deleted jobs.
 
     `permit` raises if the user may not restore it; `among` tests the scope. NotFoundError: nothing of this name was
-    deleted within the grace time. ConflictError: the name is in use again, or a dependency is deleted.
+    deleted within the grace time. ConflictError: the name is in use again, or an asset that it needs is deleted.
     """
     known = [one for one in deletions(services.store, what) if name in (one.id, one.name) and among(one)]
     if not known:
@@ -149,7 +147,7 @@ def restore(
 
 
 def _restore(services: Services, deletion: Deletion, connection: Connection) -> None:
-    """Restore stored objects, then rows, then remove the deletion; requires the index's write lock."""
+    """Restore stored objects, then rows, then remove the deletion record; call within a write transaction."""
     store, record, folder = services.store, _record_of(deletion), removed_folder(deletion)
     waiting = names.deletion_key(deletion.what, deletion.id)
     if not store.exists(waiting) and store.exists(record):
@@ -164,7 +162,7 @@ def _restore(services: Services, deletion: Deletion, connection: Connection) -> 
         _restore_rows(services, deletion, connection)
     except ConflictError:
         if not store.exists(waiting):
-            put_record(store, waiting, deletion)  # The controller will remove it again.
+            put_record(store, waiting, deletion)  # The garbage collector will move the objects again.
         raise
     store.delete(waiting)
     store.delete(f"{folder}/deletion.json")
@@ -208,9 +206,8 @@ def _restore_jobs(services: Services, deletion: Deletion, connection: Connection
         if one.id in wanted and one.at >= deletion.at:
             newest.setdefault(one.id, one)
     for one in newest.values():
-        if services.store.exists(names.deletion_key("job", one.id)) or not services.store.exists(
-            names.job_record_key(one.id)
-        ):
+        is_waiting = services.store.exists(names.deletion_key("job", one.id))
+        if is_waiting or not services.store.exists(names.job_record_key(one.id)):
             _restore(services, one, connection)
 
 
@@ -245,29 +242,32 @@ def _record_last(keys: Iterable[str], record: str) -> list[str]:
     return sorted(keys, key=lambda key: (key == record, key))
 
 
-def _put(put: Put, deletion: Deletion) -> None:
+def _put(put: Put, **values: Any) -> None:
+    deletion = Deletion(at=timestamp(), **values)
     put(names.deletion_key(deletion.what, deletion.id), deletion)
 
 
 class GarbageCollector:
+    """Executes deletions, and deletes stored objects whose grace time is over."""
+
     def __init__(self, services: Services, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._services = services
         self._clock = clock
 
     def advance(self, budget_s: float = BUDGET_S) -> bool:
-        """Work for at most `budget_s`; return whether work is left."""
+        """Execute deletions for about `budget_s` [s]; return whether work is left."""
         deadline = self._clock() + budget_s
         for _, deletion in self._records(Deletion, names.DELETIONS):
             if self._clock() > deadline or not self._execute(deletion, deadline):
                 return True
-            log.info("the stored objects of %s %s are removed", deletion.what, deletion.id)
+            log.info("the stored objects of %s %s are moved to removed/", deletion.what, deletion.id)
         return False
 
     def collect(self, budget_s: float = BUDGET_S) -> bool:
-        """Remove stored objects whose grace time is over, and unused shards; return whether work is left."""
+        """Delete stored objects whose grace time is over, and unneeded shards; return whether work is left."""
         deadline = self._clock() + budget_s
         before = timestamp(self._services.settings.shard_grace_s)
-        # The record of a deletion is removed last.
+        # The record of a deletion is deleted last.
         removed = [entry.key for entry in self._services.store.list(names.REMOVED)]
         for key in sorted(removed, key=lambda key: key.endswith("/deletion.json")):
             if self._clock() > deadline:
@@ -279,7 +279,7 @@ class GarbageCollector:
             return False  # A job with an unreadable record may need one of these shards.
         for key, released in self._records(DeletedJob, names.RELEASED):
             if released.at > before:
-                break  # All further records are younger.
+                break  # The keys begin with the time, so all further records are younger.
             for stage, shard in self._unneeded(released):
                 if self._clock() > deadline:
                     return True
@@ -288,7 +288,7 @@ class GarbageCollector:
         return False
 
     def _records(self, model: type[RecordT], folder: str) -> Iterator[tuple[str, RecordT]]:
-        """Yield readable records in the order of their keys."""
+        """Yield key and content of the readable records below a folder, ordered by key."""
         for key in sorted(entry.key for entry in self._services.store.list(folder)):
             try:
                 yield key, read_record(model, self._services.store, key)
@@ -296,10 +296,10 @@ class GarbageCollector:
                 log.warning("%s", error)
 
     def _execute(self, deletion: Deletion, deadline: float) -> bool:
-        """Remove rows that a killed process left, then stored objects; return whether all is done."""
+        """Remove rows and move stored objects of a deleted resource; return whether all is done."""
         with self._services.index.database.write_transaction() as connection:
             if not self._services.store.exists(names.deletion_key(deletion.what, deletion.id)):
-                return True  # The resource was restored after the listing.
+                return True  # The resource was restored meanwhile.
             removals = self._services.index.removals
             if deletion.what == "job":
                 removals.remove_job(deletion.id, within=connection)
@@ -313,7 +313,7 @@ class GarbageCollector:
         return True
 
     def _remove_jobs_of(self, dataset: str, deadline: float) -> bool:
-        """Delete jobs that were planned for this dataset and are in no other; return whether all are gone."""
+        """Delete jobs planned for this dataset that are in no other; return whether all are deleted."""
         try:
             jobs = load_dataset(self._services.store, dataset).jobs
         except (NotFoundError, DamagedError):
@@ -338,7 +338,7 @@ class GarbageCollector:
             yield from ((stage, shard) for stage, shard in some if shard in unneeded)
 
     def _remove_shard(self, stage: Stage, shard: str) -> None:
-        """Remove the manifest first, so the shard no longer exists; a job entered meanwhile makes it again."""
+        """Delete a shard unless a task produces it, manifest first: a shard without manifest does not exist."""
         with self._services.index.database.write_transaction() as connection:
             if self._services.index.removals.remove_shard(shard, within=connection):
                 self._services.store.delete(names.shard_manifest_key(stage, shard))

@@ -23,7 +23,7 @@ Near = Literal["hand and object", "hand", "all"]
 
 _TARGET: Final = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*([0-9]*\.?[0-9]+)\s*")
 _EXAMPLES: Final = {False: "gsr>=0.6, epsilon>=0.2 or pd_mm<=1", True: "lift>=0.9, lift_hard>=0.7 or robust>=0.95"}
-#: Properties that runs of a chart share with a request, the most specific first.
+#: Names and properties of the runs of a chart that are similar to a request, the most similar first.
 _NEAR: Final[tuple[tuple[Near, tuple[str, ...]], ...]] = (
     ("hand and object", ("hand", "object")),
     ("hand", ("hand",)),
@@ -39,7 +39,7 @@ class ChosenFidelity(NamedTuple):
 
 @dataclass
 class _Chart:
-    """Stored chart, with its measured hands and objects."""
+    """Stored chart, and the fidelities chosen from it."""
 
     key: str
     content: Row
@@ -55,11 +55,7 @@ class _Chart:
 
 
 class Resolver:
-    """Replaces `auto` by a fidelity. Each chart is read once, at the first request that needs it.
-
-    Requests for a free object use the newest chart of free objects; requests with a scene use the newest chart of that
-    kind of scene (`scene_chart_kind`). A grasp that resists six pushes may fail to leave a bin.
-    """
+    """Replaces the fidelity `auto`, by the newest chart of free objects or of the kind of scene."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -70,12 +66,12 @@ class Resolver:
         return self.choose(request)[0]
 
     def choose(self, request: JobRequest) -> tuple[JobRequest, Choice | None]:
-        """Return the request without `auto`, and the reason (None if unchanged); InputError without a match."""
+        """Return the request with `auto` replaced, and how (None: unchanged); InputError without a match."""
         if request.fidelity != AUTO:
             return request, None
         chart = self._chart(request)
         pair = (request.hand, request.object)
-        # All hands without runs in the chart share one result.
+        # The result is the same for all hands without runs in the chart.
         hand = request.hand if request.hand in chart.hands else ""
         key = (request.method, request.target, *(pair if pair in chart.pairs else (hand, "")))
         if key not in chart.found:
@@ -107,7 +103,7 @@ def _no_chart_text(request: JobRequest) -> str:
 
 
 def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
-    """Parse `gsr>=0.6` into metric and bound; in a scene `lift>=0.9`. InputError for any other text."""
+    """Parse a target (`gsr>=0.6`, in a scene `lift>=0.9`) into metric and bound; InputError if invalid."""
     known, examples = IN_SCENES if in_scene else FREE, _EXAMPLES[in_scene]
     found = _TARGET.fullmatch(text)
     if found is None:
@@ -122,10 +118,9 @@ def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
 
 
 def cheapest_fidelity(chart: Row, target: str, *, method: str, hand: str, object_: str) -> ChosenFidelity:
-    """Return a method's fastest fidelity (valid grasps per second) that meets a target; else InputError.
+    """Return the method's fidelity with most valid grasps per second that meets a target, else InputError.
 
-    Runs of the same hand and object count, else runs of the hand, else all runs. In a chart of scenes only grasps
-    planned in the scene count, by lifted grasps per second.
+    Runs of the same hand and object count, else of the hand, else all; in scenes, only grasps planned there.
     """
     in_scene = "scene" in chart
     metric, bound = parse_target(target, in_scene=in_scene)
@@ -151,7 +146,7 @@ def cheapest_fidelity(chart: Row, target: str, *, method: str, hand: str, object
 
 
 def _nearest(runs: Sequence[Row], metric: str, wanted: Mapping[str, str]) -> tuple[Near, list[Row]] | None:
-    """Return the most similar runs, at least one of which has a value of `metric`."""
+    """Return the most similar runs that include `metric`, with the kind of similarity; None without any."""
     for measured_on, same in _NEAR:
         near = [run for run in runs if all(run[name] == wanted[name] for name in same)]
         if any(run.get(metric) is not None for run in near):
@@ -160,12 +155,12 @@ def _nearest(runs: Sequence[Row], metric: str, wanted: Mapping[str, str]) -> tup
 
 
 def _speed(runs: Sequence[Row], fidelity: str) -> float:
-    """Return the mean speed of a fidelity's runs; a run without grasps, or a refused one, has speed 0."""
+    """Return the mean speed of a fidelity's runs; a run without a speed counts as 0."""
     own = [run for run in runs if run["fidelity"] == fidelity]
     return sum(float(next((run[key] for key in SPEEDS if key in run), None) or 0.0) for run in own) / len(own)
 
 
 def _mean(runs: Sequence[Row], fidelity: str, metric: str) -> float | None:
-    """Return the mean of a metric over a fidelity's runs that have it; None if none has."""
+    """Return the mean of a metric over the runs of a fidelity that have a value; None without any."""
     values = [float(run[metric]) for run in runs if run["fidelity"] == fidelity and run.get(metric) is not None]
     return sum(values) / len(values) if values else None

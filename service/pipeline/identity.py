@@ -1,8 +1,8 @@
 """Identity of the service that owns a store, an index and a Redis.
 
-Two services with a common store, index or Redis would undo each other's work. The store contains a chain of create-only
-records; the last record identifies its service. Index and Redis repeat the id. If either is lost, the other identifies
-the service. If both are empty, they count as a second service; `graspd admin index rebuild` gives it the store.
+Two services with a common store, index or Redis would undo each other's work. The store contains create-only records
+with service ids, of which the last one applies; index and Redis repeat it. If both are empty, they count as another
+service, until `graspd admin index rebuild` gives that service the store.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class ServiceRecord(Record):
 
 @dataclass(frozen=True)
 class Identity:
-    """Service ids in store, index, Redis and data folder."""
+    """Service ids in store (`chain`, the last one applies), index, Redis and data folder."""
 
     chain: Sequence[str]
     index: str | None = None
@@ -49,14 +49,14 @@ class Identity:
 
     @property
     def is_same(self) -> bool:
-        """Whether the index, else Redis or the data folder, has the id of the store's last service."""
+        """Whether the index (without an id there, Redis or the data folder) has the store's last id."""
         if self.index is not None:
             return self.index == self.chain[-1]
         others = {self.redis, self.folder} - {None}
         return self.chain[-1] in others or (self.is_own_store and not others)
 
     def refusal(self, store: str, *, take_over: bool = False) -> str:
-        """Return why a process must not work here, in one line; "" if it may."""
+        """Return why a process must not use these backends, in one line; "" if it may."""
         if self.redis is not None and self.redis not in (*self.chain, self.index):
             return _REDIS
         if not self.chain or self.is_same or take_over:
@@ -81,21 +81,17 @@ def identify(
 ) -> str:
     """Check that store, index and Redis belong to one service; write its id where missing; return the id.
 
-    Args:
-        folder: data folder that also stores the id.
-        ask_redis: False while Redis is not started.
-        take_over: replace the service of the store by this one.
-        holds_redis: this process has the controller's lease, so Redis belongs to its service in any case.
-
-    Raises BusyError if one of them belongs to another service.
+    `folder` is a data folder that also stores the id. `ask_redis` is False while Redis is not started. `take_over`
+    gives the store to this service. `holds_redis`: this process has the controller's lease, so Redis belongs to it.
+    BusyError: a backend belongs to another service.
     """
-    # Redis is read before store and index, so that concurrent new processes see each other's writes.
+    # Redis is read first, so that concurrent new processes see each other's writes.
     redis = services.queue.service() if ask_redis else None
     left = recorded_service(folder)
     chain = service_ids(services.store)
     index = services.index.notes.service()
     if not chain:
-        # Only an incomplete index can remain from a start that was killed here.
+        # An incomplete index may remain from a first start that was killed.
         if index is not None and not take_over and services.index.notes.completeness() is not None:
             raise BusyError(_foreign_index_error(services.store.url))
         index = services.index.notes.name_service(index or secrets.token_hex(_BYTES))
@@ -128,7 +124,7 @@ def identify_if_redis_answers(services: Services, *, folder: Path | None = None,
 
 
 def check_service(store: Store, redis: str | None) -> bool:
-    """Return whether Redis already has the store's service id; BusyError if it has another service's."""
+    """Return whether Redis has a service id, given as `redis`; BusyError if it is not an id of the store."""
     if redis is not None and redis not in service_ids(store):
         raise BusyError(_REDIS)
     return redis is not None

@@ -1,4 +1,4 @@
-"""Application of events to the index. An event only refers to the store, which has the data."""
+"""Application of events to the index. An event only names its data, which is read from the store."""
 
 from __future__ import annotations
 
@@ -27,17 +27,16 @@ from graspd.service.store.records import read_record
 log = logging.getLogger(__name__)
 _REMEMBERED_JOBS: Final = 10_000
 _REMEMBERED_TASKS: Final = 100_000
-#: Maximum number of batches indexed in one transaction; other writers wait for a fraction of a second.
+#: Maximum number of batches per transaction, so that other writers wait for a fraction of a second.
 _BATCHES_AT_ONCE: Final = 200
-#: Manifests in memory at once, each of up to 64 batches.
+#: Maximum number of manifests in memory, each of up to 64 batches.
 _MANIFESTS_AT_ONCE: Final = 32
 _READERS: Final = 8
-
 _NEEDS_STORE: Final = frozenset({EventKind.FINISHED, EventKind.FAILED})
 
 
 class Indexer:
-    """Apply events; notify listeners of changed job states."""
+    """Applies events to the index, and publishes changed states of jobs."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
@@ -47,7 +46,7 @@ class Indexer:
         self._readers = ThreadPoolExecutor(_READERS, thread_name_prefix="manifests")
 
     def apply(self, events: Sequence[Event]) -> list[int]:
-        """Update the index idempotently; return the positions of events to repeat when the store is available."""
+        """Apply events; return the positions of those to apply again, because the store was unavailable."""
         started: dict[str, str] = {}
         finished: list[int] = []
         left: list[str] = []
@@ -62,7 +61,7 @@ class Indexer:
                 left.append(event.worker)
             elif event.kind is not EventKind.JOB:
                 self._start(started)
-                # An unavailable store must not delay events that do not need it.
+                # While the store is unavailable, only events that do not need it are applied.
                 if not (waiting and event.kind in _NEEDS_STORE) and self._apply(event):
                     continue
                 waiting.append(place)
@@ -73,14 +72,14 @@ class Indexer:
         return sorted(waiting)
 
     def _start(self, started: dict[str, str]) -> None:
-        """Mark tasks as started by workers; remove them from the argument."""
+        """Mark tasks, mapped to their workers, as running; then clear the mapping."""
         if started:
             with _skip_invalid(f"the start of {len(started)} tasks"):
                 self.publish_states(self._services.index.live.set_running(started))
             started.clear()
 
     def _finish(self, events: Sequence[Event], places: Sequence[int]) -> list[int]:
-        """Index finished shards; return the positions of events that must wait for the store."""
+        """Index the shards of finished tasks; return the positions of events that must wait for the store."""
         made, waiting = list[ShardManifest](), []
         for place, found in self._load_manifests(events, places):
             if isinstance(found, ShardManifest):
@@ -105,7 +104,7 @@ class Indexer:
             yield from zip(some, self._readers.map(self._load, [events[place] for place in some]), strict=True)
 
     def _load(self, event: Event) -> ShardManifest | Exception:
-        """Return the manifest of a shard, or the error; reads run in parallel, because latency dominates."""
+        """Return the manifest of a finished task, or the error, so that a thread pool can read many."""
         try:
             assert event.stage is not None
             return load_manifest(self._services.store, event.stage, event.output)
@@ -113,7 +112,7 @@ class Indexer:
             return error
 
     def _index(self, made: list[ShardManifest]) -> None:
-        """Index shards in one transaction; if the index rejects one of them, index each by itself."""
+        """Index shards in one transaction; if it is rejected, index each shard by itself."""
         try:
             states = self._services.index.write.add_manifests(made) if made else {}
         except InputError:
@@ -127,11 +126,12 @@ class Indexer:
         self._tally.count_shards(made)
 
     def publish_states(self, states: Mapping[str, State]) -> None:
+        """Publish the states of jobs that changed since they were last published."""
         changed = {job: state for job, state in states.items() if self._told.get(job) is not state}
-        if changed:
-            now = timestamp()
-            told = (Event(kind=EventKind.JOB, at=now, job_id=job, message=s.value) for job, s in changed.items())
-            self._services.queue.publish(*told)
+        now = timestamp()
+        events = [Event(kind=EventKind.JOB, at=now, job_id=job, message=s.value) for job, s in changed.items()]
+        if events:
+            self._services.queue.publish(*events)
         for job, state in changed.items():
             log.info("job is %s", state, extra={"job": job})
             if state.is_final:
@@ -153,11 +153,14 @@ class Indexer:
     def failed(self, attempt: AttemptRecord, *, at_once: bool = False) -> None:
         """Index a failed attempt; the next one follows after a back-off, or at once."""
         wait = 0.0 if at_once else backoff(self._services.settings.retry_backoff_s, attempt.number)
-        not_before = time.time() + wait
-        state = self._services.index.write.add_attempt(attempt, not_before=not_before)
+        state = self._services.index.write.add_attempt(attempt, not_before=time.time() + wait)
         if state is not None:
-            about: dict[str, object] = {"job": attempt.job_id, "task": attempt.task_id}
-            about |= {"attempt": attempt.number, "worker": attempt.worker}
+            about = {
+                "job": attempt.job_id,
+                "task": attempt.task_id,
+                "attempt": attempt.number,
+                "worker": attempt.worker,
+            }
             log.warning("attempt failed: %s: %s", attempt.kind, attempt.reason, extra=about)
             self._tally.count_failure(attempt.stage.value, attempt.kind)
             self.publish_states({attempt.job_id: state})
@@ -180,7 +183,7 @@ class Indexer:
             kind, _, digest = event.output.partition("/")
             self.checked(AssetKind(kind), digest)
         elif event.kind is EventKind.FAILED and event.stage is Stage.INGEST:
-            # Without a result the upload is undecided: the check is repeated.
+            # A check that ended without a result is repeated.
             self._defer(event)
         elif event.kind is EventKind.FAILED:
             self.failed(read_record(AttemptRecord, self._services.store, attempt_key(event.task_id, event.attempt)))
@@ -199,18 +202,17 @@ class Indexer:
         self._set_waiting(event, time.time() + wait, f"waits: {event.message}")
 
     def _set_waiting(self, event: Event, not_before: float, message: str | None) -> None:
+        live = self._services.index.live
         if event.stage is Stage.INGEST:
             digest = event.output.partition("/")[2]
-            self._services.index.live.set_asset_waiting([digest], queued=False, not_before=not_before, message=message)
+            live.set_asset_waiting([digest], queued=False, not_before=not_before, message=message)
         else:
-            self.publish_states(
-                self._services.index.live.set_waiting([event.task_id], not_before=not_before, message=message)
-            )
+            self.publish_states(live.set_waiting([event.task_id], not_before=not_before, message=message))
 
 
 @contextmanager
 def _skip_invalid(what: str) -> Iterator[None]:
-    """Skip an invalid event: any client of Redis can write invalid events, which must not block others."""
+    """Log and skip an invalid event: any client of Redis can write one, which must not block others."""
     try:
         yield
     except UnavailableError:
@@ -219,16 +221,13 @@ def _skip_invalid(what: str) -> Iterator[None]:
         log.exception("%s is ignored", what)
 
 
-#: Maximum number of pairs of stage and error name with a series of their own, because names can be forged.
+#: Maximum number of pairs of stage and error name with their own series, because names can be forged.
 MOST_KINDS: Final = 60
 OTHER_KIND: Final = "other"
 
 
 class Tally:
-    """In-memory counts for `/metrics`; `flush` adds them to the sums in Redis that all API processes show.
-
-    A loss of Redis resets the sums, which Prometheus counts as a restart. A repeated event counts twice.
-    """
+    """In-memory counts for `/metrics`; `flush` adds them to the sums in Redis."""
 
     def __init__(self, count: Callable[[Mapping[str, float]], None]) -> None:
         """`count` adds amounts to the sums in Redis."""
@@ -248,14 +247,13 @@ class Tally:
                 self.add("graspd_grasps_total", "validated", amount=manifest.validated)
 
     def count_failure(self, stage: str, kind: str) -> None:
-        if (stage, kind) not in self._kinds:
-            if len(self._kinds) >= MOST_KINDS:
-                kind = OTHER_KIND
-            self._kinds.add((stage, kind))
+        if (stage, kind) not in self._kinds and len(self._kinds) >= MOST_KINDS:
+            kind = OTHER_KIND
+        self._kinds.add((stage, kind))
         self.add("graspd_task_failures_total", stage, kind)
 
     def flush(self) -> None:
-        """Add the counts to the sums; after QueueUnavailable they stay for the next call."""
+        """Add the counts to the sums; QueueUnavailable keeps them for the next call."""
         if self._amounts:
             self._count(self._amounts)
             self._amounts.clear()

@@ -1,7 +1,6 @@
-"""Integrity of a store: check against checksums, scan by the controller, repair.
+"""Integrity of a store: check of stored objects, repeated scan by the controller, repair.
 
-The check covers shards, records and uploads, and changes nothing. The scan is repeated and rate-limited; it resumes at
-its last position. A repair makes damaged shards again, since a shard is a function of its inputs.
+The check changes nothing. The scan has a limited rate and can resume. A repair makes damaged shards again.
 """
 
 from __future__ import annotations
@@ -56,21 +55,20 @@ from graspd.service.store.records import (
 from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
-#: Least interval of rounds over a small store [s].
+#: Minimum interval between the starts of two rounds [s].
 ROUND_S: Final = 3600.0
-#: Interval [s] of checks of known damage, so that repaired entries soon leave the list.
+#: Interval [s] at which known damage is checked again.
 _AGAIN_S: Final = 60.0
 _KNOWN: Final = 1000
-#: Keys in memory at once; further keys need another listing of the folder.
+#: Maximum number of keys in memory; more keys need another listing of the folder.
 _KEYS: Final = 10_000
-#: Each stored object counts as at least this size [bytes], so that a million small ones are not read at once.
+#: Size [bytes] that is added for each stored object, to limit the rate of small ones.
 _LEAST: Final = 16 * 2**10
-#: Longest pause [s] that faster reads may make up afterwards.
+#: Maximum delay [s] that faster reads may make up for.
 _BURST_S: Final = 0.25
-#: Interval [s] of queries whether `graspd admin store verify` pauses the scan.
+#: Interval [s] of queries whether the scan is paused by `graspd admin store verify`.
 _PAUSE_S: Final = 5.0
 _OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)")
-
 #: Key patterns of records, and the model of each.
 _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"assets/[^/]+/[^/]+/asset\.json", Asset),
@@ -106,15 +104,13 @@ FOLDERS: Final = (
     names.REMOVED,
 )
 _SEALED: Final = (".json", ".zip", ".npz", ".glb")
-_UPLOAD: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(files\.zip|check\.json)")
 _SHARD: Final = re.compile(r"shards/(base|scene|views)/([0-9a-f]{32})\.(h5|json)")
 STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
-
 MISSING: Final = "its file is missing"
 NO_MANIFEST: Final = "it has no manifest"
 BAD_MANIFEST: Final = "its manifest is damaged"
 FOREIGN: Final = "graspd did not write it"
-#: Time [s] for which a file may lack its manifest.
+#: Time [s] for which a new file may lack its manifest.
 _ON_ITS_WAY_S: Final = 60.0
 Read = Callable[[int], object]
 #: Called with the key of each stored object that has no checksum.
@@ -124,7 +120,7 @@ Unsealed = Callable[[str], None]
 def scan(
     store: Store, *folders: str, read: Read = lambda size: None, unsealed: Unsealed = lambda key: None
 ) -> Iterator[tuple[str, Damage | None]]:
-    """Yield each checkable key in all or some folders, with the damage of its stored object or None."""
+    """Yield the key of each checked object in all or some folders, with its damage or None."""
     for folder in folders or FOLDERS:
         for entry in store.list(folder):
             if is_checked(entry.key):
@@ -132,7 +128,7 @@ def scan(
 
 
 def may_await_manifest(store: Store, one: Damage) -> bool:
-    """Check whether a recent file may still lack its manifest, which its worker writes next."""
+    """Return whether a file without manifest is so recent that its worker may still write the manifest."""
     try:
         return one.what == NO_MANIFEST and (age_of(store.stamp(one.key)[1]) or 0.0) < _ON_ITS_WAY_S
     except NotFoundError:
@@ -146,7 +142,7 @@ def is_checked(key: str) -> bool:
 def examine(
     store: Store, key: str, *, read: Read = lambda size: None, unsealed: Unsealed = lambda key: None
 ) -> Damage | None:
-    """Return the damage of one stored object or None; the file of a shard is checked with its manifest."""
+    """Return the damage of a stored object or None; the file of a shard is checked with its manifest."""
     try:
         if not key.startswith(f"{names.SHARDS}/"):
             return _check_sealed(store, key, read, unsealed)
@@ -156,7 +152,7 @@ def examine(
         if ending == "json":
             return _check_manifest(store, key, STAGES[kind], shard, read, unsealed)
         manifest = names.shard_manifest_key(STAGES[kind], shard)
-        # A worker writes the manifest last; it may have arrived since the listing.
+        # The manifest is written last, possibly between these calls.
         orphan = not store.exists(manifest) and store.exists(key) and not store.exists(manifest)
         return Damage(key, NO_MANIFEST, shard) if orphan else None
     except NotFoundError:
@@ -164,8 +160,8 @@ def examine(
 
 
 def _check_sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | None:
-    """Check a stored object by its own checksum, or without checksum by its content as far as possible."""
-    match = _UPLOAD.fullmatch(key)
+    """Check a stored object by the checksum that it contains; parse records and checks of assets."""
+    match = _OF_ASSET.fullmatch(key)
     model = next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
     try:
         if not is_sealed(key, _count_bytes(store.stream(key), read), store.size(key)):
@@ -214,9 +210,8 @@ def _check_manifest(store: Store, key: str, stage: Stage, shard: str, read: Read
         if (size := store.size(file)) != manifest.size_bytes:
             return Damage(file, f"it has {size} bytes, expected {manifest.size_bytes}", shard)
         digest = hashlib.sha256()
-        for chunk in store.stream(file):
+        for chunk in _count_bytes(store.stream(file), read):
             digest.update(chunk)
-            read(len(chunk))
     except NotFoundError:
         return Damage(file, MISSING, shard) if store.exists(key) else None
     if digest.hexdigest() != manifest.sha256:
@@ -225,11 +220,11 @@ def _check_manifest(store: Store, key: str, stage: Stage, shard: str, read: Read
 
 
 class Interrupted(Exception):
-    """The process stops, or `graspd admin store verify` reads the store."""
+    """The process stops, or `graspd admin store verify` pauses the scan."""
 
 
 class IntegrityScan:
-    """Read through the store; record new and repaired damage in the index."""
+    """Checks all stored objects in rounds, and updates the list of damage in the index."""
 
     def __init__(
         self, services: Services, stop: threading.Event, *, clock: Callable[[], float] = time.monotonic
@@ -255,7 +250,7 @@ class IntegrityScan:
             self._stop.wait(_PAUSE_S)
 
     def _may_read(self) -> bool:
-        """Check that `store verify` does not pause the scan; query the index every few seconds."""
+        """Return whether the scan is not paused; the index is queried every `_PAUSE_S`."""
         now = self._clock()
         if now - self._asked >= _PAUSE_S:
             if self._services.index.notes.is_scan_paused():
@@ -264,7 +259,7 @@ class IntegrityScan:
         return True
 
     def advance(self) -> bool:
-        """Check further keys; return False if no round is due. Interrupted: stop, or `store verify` runs."""
+        """Check the next `_KEYS` keys; return False if no round is due; Interrupted as in the class."""
         self._recheck_if_due(None)
         note = self._services.index.notes.scan_note()
         if note.folder >= len(FOLDERS):
@@ -291,7 +286,7 @@ class IntegrityScan:
             self.recheck_damage()
 
     def recheck_damage(self) -> None:
-        """Check known damage again; remove repaired and deleted entries from the list."""
+        """Check known damage again; remove repaired and deleted objects from the list."""
         self._looked = self._clock()
         _, known = self._services.index.damage.summary(limit=_KNOWN)
         if well := [one.key for one in known if self._is_repaired(one)]:
@@ -314,7 +309,7 @@ class IntegrityScan:
         return heapq.nsmallest(_KEYS, (entry.key for entry in listed))
 
     def _pace(self, size: int) -> None:
-        """Wait until `size` more bytes are within the rate."""
+        """Wait until `size` more bytes are within the rate; Interrupted if the scan must end."""
         now = self._clock()
         self._paid = max(self._paid, now - _BURST_S) + size / self._rate
         if self._stop.wait(max(0.0, self._paid - now)) or not self._may_read():
@@ -322,10 +317,7 @@ class IntegrityScan:
 
 
 def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
-    """Move damaged files to `damaged/` and queue tasks that remake them; return repaired and other damage.
-
-    A worker stores a repaired shard only if its checksum equals the manifest's.
-    """
+    """Move damaged files to `damaged/`, queue tasks to make them again; return repaired and other damage."""
     harmed = {one.shard for one in found if one.shard}
     repaired, left = [], []
     for one in found:
@@ -337,7 +329,7 @@ def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], l
 
 
 def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
-    """Repair one stored object; return why this is impossible, or ""."""
+    """Repair a stored object; return why this is impossible, or ""."""
     if one.what == FOREIGN:
         services.store.set_aside(one.key)
         return ""
@@ -366,19 +358,15 @@ def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
 
 
 def _repair_asset(services: Services, key: str, kind: AssetKind, digest: str, file: str) -> str:
-    """Move derived files of a hand or an object away; a new check and the next task make them again.
-
-    Built-in assets are stored again from the program.
-    """
-    if (kind, digest) in {(one.kind, one.digest) for one in builtin_assets()}:
-        services.store.set_aside(key)
-        publish_builtins(services.store)
-    elif file == "files.zip":
+    """Move files of an asset away that a check or the next task makes again; store built-in assets again."""
+    is_builtin = (kind, digest) in {(one.kind, one.digest) for one in builtin_assets()}
+    if file == "files.zip" and not is_builtin:
         return "upload the same files again, or put a copy in its place"
-    elif file == "asset.json":
+    if file == "asset.json" and not is_builtin:
         return "put a copy in its place"
-    else:
-        services.store.set_aside(key)
+    services.store.set_aside(key)
+    if is_builtin:
+        publish_builtins(services.store)
     if file in ("model.glb", "check.json") and not services.store.exists(key):
         services.store.set_aside(names.asset_check_key(kind, digest))
         with contextlib.suppress(NotFoundError, DamagedError):
@@ -388,7 +376,7 @@ def _repair_asset(services: Services, key: str, kind: AssetKind, digest: str, fi
 
 
 def _set_aside_result(services: Services, one: Damage, stage: Stage) -> None:
-    """Move a damaged result away; a file without manifest stays if the index contains its checksum."""
+    """Move a damaged result away; a file that the index knows stays if only its manifest is damaged."""
     file, manifest = names.shard_file_key(stage, one.shard), names.shard_manifest_key(stage, one.shard)
     if one.what == BAD_MANIFEST:
         services.store.set_aside(manifest)
@@ -404,7 +392,7 @@ def _matches_index(services: Services, shard: str, file: str) -> bool:
 
 
 def _task_of_shard(services: Services, stage: Stage, shard: str) -> tuple[JobRecord, PlannedTask] | str:
-    """Return the task that makes a shard, or the reason why there is none."""
+    """Return job and task that make a shard, or why no task can make it."""
     job = services.index.shards.job_of(shard)
     if job is None:
         return "no job makes it, so it cannot be made again; put a copy in its place"

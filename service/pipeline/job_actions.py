@@ -1,4 +1,4 @@
-"""Actions of a user on jobs (submit, cancel, retry); assets for jobs; number of tasks of a job."""
+"""Actions of users on jobs (submit, cancel, retry), checks of assets, division of jobs into tasks."""
 
 from __future__ import annotations
 
@@ -23,16 +23,7 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import job_id
 from graspd.service.model.domain import JobOptions, JobRequest, count_batches
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, SceneError, UnavailableError
-from graspd.service.model.fidelity import AUTO
-from graspd.service.model.messages import (
-    Capabilities,
-    Origin,
-    Requirements,
-    TaskMessage,
-    WorkerBeat,
-    capabilities,
-    requirements_of,
-)
+from graspd.service.model.messages import Capabilities, Origin, Requirements, WorkerBeat, capabilities, requirements_of
 from graspd.service.model.planning import message_of, priority_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import MOST_BATCHES, JobRecord, Member
@@ -42,22 +33,21 @@ from graspd.service.model.transforms import quat_conjugate, quat_rotate
 from graspd.service.model.version import SCHEMA_OF_RANGES
 from graspd.service.pipeline.backends import Services, record_transaction
 from graspd.service.pipeline.fidelity_choice import Resolver
-from graspd.service.queue.port import Event, EventKind
+from graspd.service.queue.port import Event, EventKind, Message
 from graspd.service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending_deletion
 from graspd.service.telemetry import bound_subject
 
 log = logging.getLogger(__name__)
 Options = TypeVar("Options", bound=JobOptions)
-#: Interval [s] at which held-back tasks are checked for a capable worker.
+#: Time [s] for which a task is held back if no worker is capable of it.
 HELD_S: Final = 10.0
-#: Allowed depth of a centre of mass in a support [m]: the centre was measured on another mesh.
+#: Allowed depth of a centre of mass in a support [m], because the centre was measured on another mesh.
 _SUNK_M: Final = 1e-3
-
-#: Number of finished tasks that are used to measure the time of a batch.
+#: Number of finished tasks from which the time of a batch is measured.
 _LOOKED_AT: Final = 64
-#: Number of workers assumed if none is present: a service may start them once a task waits.
+#: Assumed number of workers if none is present, because a service may start them once a task waits.
 _EXPECTED: Final = 8
-#: Cache lifetime of measured workers and rates [s].
+#: Cache lifetime of workers and costs [s].
 _KNOWN_S: Final = 10.0
 
 
@@ -65,16 +55,16 @@ class TaskRanges:
     def __init__(
         self, services: Services, *, scope: ProjectScope = EVERYTHING, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """`scope` limits the measurements that count."""
+        """`scope` limits the finished tasks whose costs are used."""
         self._services, self._scope, self._clock = services, scope, clock
         self._read_again = -math.inf
         self._workers: list[WorkerBeat] = []
         self._costs: list[BatchCost] = []
 
     def with_span(self, job: JobRecord, *, among: int = 1) -> JobRecord:
-        """Return a job with its number of batches per task; `among`: number of jobs that share the workers."""
+        """Return a job with its number of batches per task, `span`; `among` jobs share the workers."""
         batches, wanted_s = count_batches(job.request.grasps), self._services.settings.task_s
-        # The pictures of one batch already fill a file of megabytes.
+        # The shard with pictures of a single batch already has megabytes.
         if batches == 1 or job.request.views or not wanted_s:
             return job
         if self._clock() >= self._read_again:
@@ -84,7 +74,7 @@ class TaskRanges:
         able = [worker for worker in self._workers if Stage.SYNTHESIZE in worker.stages]
         if any(worker.capabilities.schemas[1] < SCHEMA_OF_RANGES for worker in able):
             return job
-        # A small job shows its grasps batch by batch; a GPU makes them all in one launch.
+        # On CPUs, an interactive job shows its grasps batch by batch; a GPU makes them in one launch.
         if job.priority is Priority.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
             return job
         rate = Rates(self._costs, job.request, {one.device for one in able}).of(job.request.hand, job.request.object)
@@ -95,18 +85,15 @@ class TaskRanges:
 
 
 def span_of(batches: int, by_time: int, workers: int) -> int:
-    """Return the batches per task of a job; `by_time` batches last the target duration of a task.
-
-    All tasks but the last have equal length, and no worker is idle while another has two tasks.
-    """
+    """Return the batches per task: at most `by_time`, fewer if workers would be idle, evenly divided."""
     most = max(1, min(by_time, MOST_BATCHES, -(-batches // max(1, workers))))
     return -(-batches // -(-batches // most))
 
 
 def usable_asset(services: Services, kind: AssetKind, name: str, scope: ProjectScope = EVERYTHING) -> AssetView:
-    """Return a hand, object or network, by name or digest, that jobs may use.
+    """Return an asset by name or digest for use in a job.
 
-    NotFoundError: none is in scope. InputError: it failed its check. ConflictError: its check is still running.
+    NotFoundError: it is not in scope. InputError: it failed its check. ConflictError: its check has not ended.
     """
     asset = services.index.assets.get(kind, name, scope=scope)
     if asset.verdict == "refuse":
@@ -125,10 +112,9 @@ def refuse_deleted(services: Services, wanted: Sequence[tuple[AssetKind, str]], 
 def with_neighbours(
     services: Services, options: Options, scope: ProjectScope = EVERYTHING
 ) -> tuple[Options, Sequence[AssetView]]:
-    """Return options with the current digest of each neighbour, and these neighbours.
+    """Return options with a digest for each neighbour, and the neighbours; given digests stay.
 
-    A digest in the request itself, for example one copied from a job, stays. Errors as in `usable_asset`; InputError if
-    a name and a digest belong to two objects.
+    Errors as in `usable_asset`; InputError: name and digest of a neighbour belong to two objects.
     """
     beside = [usable_asset(services, AssetKind.OBJECT, one.digest or one.object, scope) for one in options.beside]
     found = []
@@ -142,9 +128,9 @@ def with_neighbours(
 def with_network(
     services: Services, options: Options, hands: Sequence[AssetView | Member], scope: ProjectScope = EVERYTHING
 ) -> Options:
-    """Return options with the digest of their network; unchanged if their method uses none.
+    """Return options with the digest of their network, if they have one.
 
-    Errors as in `usable_asset`; InputError if the network proposes grasps of another hand.
+    Errors as in `usable_asset`; InputError: the network proposes grasps of another hand.
     """
     if not options.network:
         return options
@@ -159,7 +145,7 @@ def with_network(
 
 
 def submit(services: Services, request: JobRequest, *, priority: Priority | None = None) -> tuple[JobView, bool]:
-    """Prepare and enter a job. Equal requests give one job; `retry` restarts a failed or cancelled one."""
+    """Prepare and enter a job; return it, and whether it is new: equal requests give one job."""
     return enter_job(services, prepare(services, request, priority=priority))
 
 
@@ -171,12 +157,9 @@ def prepare(
     owner: str = "",
     scope: ProjectScope = EVERYTHING,
 ) -> JobRecord:
-    """Return the job of a request whose hand, object and network are in scope; a small job is interactive.
+    """Return the job of a request; `priority` None: interactive for a small job, else bulk.
 
-    Raises:
-        NotFoundError, ConflictError: as in `usable_asset`, also of neighbours and network.
-        InputError: a failed check; a network of another hand; no chart meets the target; the object or a neighbour
-            penetrates a support of its scene (SceneError).
+    Errors of `usable_asset`, `with_neighbours`, `with_network`, `check_scene`; InputError: no fidelity is good enough.
     """
     hand = usable_asset(services, AssetKind.HAND, request.hand, scope)
     obj = usable_asset(services, AssetKind.OBJECT, request.object, scope)
@@ -185,7 +168,7 @@ def prepare(
     check_scene(request, obj, beside)
     services.queue.ping()
     named = request.model_copy(update={"hand": hand.name, "object": obj.name})
-    request, choice = Resolver(services.store).choose(named) if named.fidelity == AUTO else (named, None)
+    request, choice = Resolver(services.store).choose(named)
     origin = Origin(request=bound_subject("request"), key=bound_subject("key"))
     record = JobRecord(
         id=job_id(request, hand.digest, obj.digest, scope.project),
@@ -205,12 +188,11 @@ def prepare(
 def enter_job(services: Services, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
     """Record a planned job and queue its first tasks; return the job, and whether it is new.
 
-    The controller enters the rest. With `keeps_assets` a dataset protects hand, object, neighbours and network from
-    deletion meanwhile. NotFoundError: one of them was deleted. ConflictError: the same job was deleted, and its
-    stored objects are still being removed.
+    The controller queues the other tasks. `keeps_assets`: a dataset protects the assets from deletion.
+    NotFoundError: an asset was deleted. ConflictError: the same job was deleted, and its stored objects still exist.
     """
     key = names.job_record_key(record.id)
-    # A dataset needs its jobs even after an interruption, and must not hold the lock while it accesses the store.
+    # The record of a dataset's job is written before the transaction, so that the index is locked for less time.
     new = keeps_assets and put_record(services.store, key, record)
     with record_transaction(services, [key] if new else []) as (connection, put):
         new = new or (not keeps_assets and put(key, record))
@@ -227,9 +209,9 @@ def enter_job(services: Services, record: JobRecord, *, keeps_assets: bool = Fal
 
 
 def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
-    """Stop a job: waiting tasks never start, running ones stop at the next launch; finished shards stay.
+    """Stop a job: waiting tasks never start, running ones stop at the next launch, finished shards stay.
 
-    The job's event names the causing event of a dataset, if any. ConflictError for a job that has ended.
+    `cause` is the dataset event that caused this, if any. ConflictError: the job has ended.
     """
     with _transaction(services, job_id, _refuse_ended) as add:
         in_queue = services.index.feed.unfinished_tasks(job_id)
@@ -237,12 +219,12 @@ def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
     try:
         services.queue.discard(in_queue)
     except UnavailableError as error:
-        log.warning("job %s is cancelled; its queued tasks are removed once the queue answers: %s", job_id, error)
+        log.warning("job %s is cancelled; its queued tasks are removed when the queue answers: %s", job_id, error)
     return _publish_state(services, job_id)
 
 
 def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
-    """Queue the failed and cancelled tasks of a job again, with fresh attempts; ConflictError without any."""
+    """Restart unsuccessful tasks of a failed or cancelled job, with new attempts; else ConflictError."""
     with _transaction(services, job_id, _require_failures) as add:
         add("retried", services.index.feed.failed_tasks(job_id), cause=cause)
     _start(services, job_id)
@@ -252,8 +234,9 @@ def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
 @dataclass(frozen=True)
 class Route:
     apart: bool = False
-    """Whether the task enters a list that only some workers of its stage read."""
+    """Whether the task waits in a separate list, which only capable workers read."""
     held: str = ""
+    """Reason for which the task is held back; empty if it is not."""
 
 
 class Routes:
@@ -265,24 +248,23 @@ class Routes:
                     self._here[stage].append(beat.capabilities)
 
     def route_of(self, need: Requirements) -> Route:
-        """Return the route of a task.
+        """Choose the common list if all workers of the stage are capable, a separate one if some are.
 
-        If all workers of its stage are capable, the task enters their common list; if some are capable, a separate
-        list. It is held back if none is capable. Without workers, this version's capabilities are assumed.
+        If none is, the task is held back. Without workers, the capabilities of this version are assumed.
         """
         here = self._here.get(need.stage) or [capabilities()]
-        lacking = {one.lacks(need) for one in here} - {""}
-        if all(one.lacks(need) for one in here):
+        lacking = {one.lacks(need) for one in here}
+        if "" not in lacking:
             return Route(held=f"held back, because no present worker is capable: {'; '.join(sorted(lacking))}")
-        return Route(apart=bool(lacking))
+        return Route(apart=lacking != {""})
 
 
 def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Routes, again: bool = False) -> set[str]:
-    """Queue tasks with a capable worker and mark them in the index; return why the others wait.
+    """Mark tasks with a capable worker as queued and queue them; return why others are held back.
 
-    The mark comes first: the controller queues marked tasks that are missing; unmarked ones might run twice.
+    A kill in between does no harm: the controller queues marked tasks that the queue lacks.
     """
-    to_queue: dict[tuple[Priority, bool], list[TaskMessage]] = defaultdict(list)
+    to_queue: dict[tuple[Priority, bool], list[Message]] = defaultdict(list)
     held: dict[str, list[str]] = defaultdict(list)
     for task in ready:
         most = task.retried_upto + services.settings.task_attempts
@@ -302,7 +284,7 @@ def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Route
 
 
 def _start(services: Services, job_id: str) -> None:
-    """Queue the part of a job that fits the queue's window; the controller queues the rest."""
+    """Queue tasks of a job until the queue's window is full; the controller queues the other ones."""
     try:
         room = services.settings.queue_window - sum(services.queue.depths().values())
         if room > 0:
@@ -315,18 +297,14 @@ def _start(services: Services, job_id: str) -> None:
 
 @contextmanager
 def _transaction(services: Services, job_id: str, refuse: Callable[[JobView], None]) -> Iterator[Callable[..., None]]:
-    """Lock a job and yield a function that appends an event, unless `refuse` raises.
-
-    Earlier events are read before the lock, because the store may be slow.
-    """
+    """Yield a function that appends an event to a job within an index transaction, unless `refuse` raises."""
+    # Earlier events are read before the transaction, because the store may be slow.
     refuse(services.index.jobs.get(job_id))
     before = job_events(services.store, job_id)
     with record_transaction(services) as (connection, put):
         refuse(services.index.jobs.get(job_id))
 
-        def add(
-            what: Literal["cancelled", "retried"], retried: dict[str, int] | None = None, *, cause: str = ""
-        ) -> None:
+        def add(what: Literal["cancelled", "retried"], retried: dict[str, int] | None = None, *, cause: str) -> None:
             event = add_job_event(services.store, job_id, what, retried, cause=cause, put=put)
             is_next = event.number == max((one.number for one in before), default=0) + 1
             events = [*before, event] if is_next else job_events(services.store, job_id)
@@ -356,10 +334,7 @@ def _publish_state(services: Services, job_id: str) -> JobView:
 
 
 def check_scene(options: JobOptions, obj: AssetView, beside: Sequence[AssetView] = ()) -> None:
-    """Raise SceneError if an object's centre of mass lies in a support: its hull then penetrates it.
-
-    Without a measured centre, and for checks that need meshes, the first task reports the error.
-    """
+    """Raise SceneError if a centre of mass lies in a support; the first task makes further checks."""
     place = options.place
     _check_pose(obj, "target", place.target, place.supports)
     for asset, one in zip(beside, place.neighbours, strict=True):

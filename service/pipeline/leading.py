@@ -1,7 +1,7 @@
-"""Leader election of controllers by a lease in Redis; the others stand by.
+"""Leader election of controllers by a lease in Redis; the others wait.
 
-Two processes may both lead briefly if one was suspended for longer than its lease. This does no harm: their writes
-follow from facts in the store, a task is queued once per attempt, and writers of the index take turns.
+Two processes may both lead briefly if one was suspended for longer than its lease. This does no harm: writes are
+idempotent, a task is queued once per attempt, and writers of the index run one at a time.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Leadership:
         self.holder = name or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
 
     def wait(self, stop: threading.Event) -> bool:
-        """Wait until this process leads; return False if it is stopped first. Redis may be unavailable."""
+        """Wait until this process leads; return False if `stop` is set first. Redis may be unavailable."""
         told = False
         while not stop.is_set():
             self._alive.touch()
@@ -52,9 +52,9 @@ class Leadership:
 
     @contextmanager
     def hold(self, stop: threading.Event) -> Iterator[threading.Event]:
-        """Hold the lease, then release it; yield an event that is set once another process leads or on `stop`.
+        """Renew the lease in a thread; yield an event that is set with `stop`, or once another process leads.
 
-        Only another holder in Redis ends the lease: while Redis is unavailable, no process can take it.
+        While Redis is unavailable, the lease continues, because no other process can take it.
         """
         over, done = threading.Event(), threading.Event()
         thread = threading.Thread(target=self._renew, args=(stop, over, done), name="controller-lease", daemon=True)

@@ -23,12 +23,12 @@ from graspd.service.store.packs import unpack_all
 from graspd.service.store.records import put_record, read_record, task_attempts
 
 log = logging.getLogger(__name__)
-#: Time [s] for which a task may be in transit between queue, worker and stream.
+#: Time [s] for which a task may be in transit, neither in the queue nor leased.
 LOST_AFTER_S: Final = 3.0
 
 
 class LeaseReaper:
-    """Detects lost leases by heartbeats that stay unchanged, timed by this process's monotonic clock."""
+    """Detects lost leases by unchanged heartbeats, timed by this process's clock."""
 
     def __init__(self, services: Services, indexer: Indexer, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._services = services
@@ -39,10 +39,10 @@ class LeaseReaper:
         self._missing: dict[str, float] = {}
 
     def reap(self, leases: Collection[Lease]) -> list[Lease]:
-        """Take tasks from workers without a heartbeat for the duration of a lease; return their leases."""
+        """Release leases without a heartbeat for the duration of a lease, and fail their tasks; return them."""
         now = self._clock()
         lease_s = self._services.settings.lease_s
-        # Time without checks, because Redis was unavailable or this process suspended, does not count as silence.
+        # Long gaps between calls do not count as silence: Redis was unavailable, or this process suspended.
         looked, self._looked = min(now - self._looked, lease_s / 3), now
         heartbeats: dict[Any, tuple[str, float]] = {}
         lost = []
@@ -58,7 +58,7 @@ class LeaseReaper:
         return lost
 
     def find_missing(self, present: Collection[str]) -> list[str]:
-        """Recover tasks that the index counts as queued but neither queue nor workers have; return their ids."""
+        """Recover tasks that are marked as queued, but for `LOST_AFTER_S` not in `present`; return their ids."""
         tasks, checks = self._services.index.feed.queued_tasks_and_checks()
         believed = tasks | {ingest_id(kind, digest) for kind, digest in checks}
         now = self._clock()
@@ -71,12 +71,11 @@ class LeaseReaper:
         return missing
 
     def _recover(self, missing: list[str]) -> None:
-        """Recover lost events from the store; queue tasks without a result in the store again."""
+        """Index results of missing tasks that the store has; mark the other ones as not queued."""
         again = []
-        for made in (
-            unpack_all(self._services.store) if missing else ()
-        ):  # Written by a worker of 0.2, in a rolling upgrade.
-            self._indexer.index_shard(made)
+        if missing:  # During an upgrade, workers of graspd 0.2 may have written packs.
+            for manifest in unpack_all(self._services.store):
+                self._indexer.index_shard(manifest)
         for task, (stage, shard) in self._services.index.feed.outputs(missing).items():
             if self._find(task, Stage(stage), shard):
                 continue
@@ -95,7 +94,7 @@ class LeaseReaper:
             self._indexer.publish_states(self._services.index.live.set_waiting(again))
 
     def _find(self, task_id: str, stage: Stage, shard: str) -> bool:
-        """Index an existing shard; return whether it exists; a damaged manifest fails its task permanently."""
+        """Index a shard if it exists; return whether it does. A damaged manifest fails its task for good."""
         try:
             self._indexer.index_shard(load_manifest(self._services.store, stage, shard))
         except NotFoundError:
@@ -131,9 +130,9 @@ class LeaseReaper:
                 self._fail_lost_check(message)
         except UnavailableError:
             raise
-        except Exception:  # Any client of Redis can forge a lease, which must not block others.
+        except Exception:  # Any client of Redis can forge a lease.
             log.exception("the lease of task %s is ignored", lease.task_id)
-        # The lease is removed last: if the store was unavailable, the next round finds the lease again.
+        # The lease is removed last, so that the next round finds it again if the store was unavailable.
         self._services.queue.release(lease)
 
     def _fail_lost_task(self, worker: str, message: TaskMessage) -> None:
@@ -153,7 +152,7 @@ class LeaseReaper:
             except DamagedError as error:
                 self._fail(message.task_id, message.stage, error)
                 return
-        # No wait: the machine causes a first loss more often than the task does.
+        # No back-off after the first attempt: its loss is more often caused by the machine than by the task.
         self._indexer.failed(attempt, at_once=attempt.number == 1)
 
     def _fail_lost_check(self, message: IngestMessage) -> None:

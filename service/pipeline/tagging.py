@@ -1,4 +1,4 @@
-"""Tags of grasps: each change writes the record, then the rows, under one write lock of the index."""
+"""Changes of tags: each writes the record, then the rows, within one write transaction of the index."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Permit = Callable[[Tag | None], None]
 def tag_grasps(
     services: Services, name: str, grasps: Collection[Grasp], *, project: str, owner: str, permit: Permit
 ) -> int:
-    """Give a tag to grasps; return how many did not have it. LimitError: more than `MOST_TAGGED`."""
+    """Add a tag to grasps; return how many did not have it. LimitError: more than `MOST_TAGGED` in all."""
 
     def added(tag: Tag) -> Tag:
         members = tag.members | set(grasps)
@@ -41,9 +41,11 @@ def tag_grasps(
 
 def untag_grasps(services: Services, tag: str, grasps: Collection[Grasp], *, permit: Permit) -> int:
     """Remove a tag, by its id, from grasps; return how many had it."""
-    before, after = _change(
-        services, tag, lambda one: one.model_copy(update={"grasps": rows_by_shard(one.members - set(grasps))}), permit
-    )
+
+    def without(one: Tag) -> Tag:
+        return one.model_copy(update={"grasps": rows_by_shard(one.members - set(grasps))})
+
+    before, after = _change(services, tag, without, permit)
     return len(before.members) - len(after.members)
 
 
@@ -74,7 +76,7 @@ def restore_tag(services: Services, tag: Tag) -> None:
 def _change(
     services: Services, tag: str, change: Callable[[Tag], Tag], permit: Permit, *, fresh: Tag | None = None
 ) -> tuple[Tag, Tag]:
-    """Change a tag; return it before and after the change. The index's lock makes changes sequential."""
+    """Change a tag, or the new tag `fresh`; return it before and after; NotFoundError without either."""
     with record_transaction(services) as (connection, put):
         found = newest_version(services.store, tag)
         known = None if found is None or found.gone else found
@@ -89,7 +91,7 @@ def _change(
             put_version(put, after)
             services.index.tags.put(after, within=connection)
     if is_changed:
-        # Older versions are dropped only after the commit, and while no other process reads the last version.
+        # Older versions are deleted after the commit, while no other process can read the last version.
         with services.index.database.write_transaction():
             drop_older_versions(services.store, after)
     return before, after

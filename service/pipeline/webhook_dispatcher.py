@@ -1,7 +1,7 @@
-"""Webhooks: signed reports of ended jobs and datasets, one per address at a time, with retries.
+"""Webhook dispatcher: signed reports of ended jobs and datasets, with retries.
 
-A failed delivery pauses all deliveries to its address. Projects take turns; within a project, the least recently used
-address comes first. Addresses whose last delivery failed share half of the slots, so the others are not delayed.
+Each webhook has one delivery at a time; a failed one delays the others. Projects take turns; within a project, the
+least recently used webhook comes first. Webhooks whose last delivery failed share half of the slots.
 """
 
 from __future__ import annotations
@@ -30,25 +30,24 @@ from graspd.service.model.webhooks import SIGNATURE, secret_of, signature
 from graspd.service.pipeline.backends import Services
 
 log = logging.getLogger(__name__)
-#: Maximum number of concurrent deliveries: in all, and to addresses whose last delivery failed.
+#: Maximum number of concurrent deliveries: in all, and of webhooks whose last delivery failed.
 AT_ONCE: Final = 32
 SLOW_AT_ONCE: Final = AT_ONCE // 2
 _PAUSE_S: Final = 1.0
-#: Interval [s] of checks for ended datasets: the summary of a large dataset takes a while.
+#: Interval [s] of checks for ended datasets, because the summary of a large dataset takes long.
 _DATASETS_EVERY_S: Final = 5.0
 _FORGET_EVERY_S: Final = 3600.0
-
 PATIENCE_S: Final = 10.0
 LOOK_UP_S: Final = 5.0
-#: Maximum number of bytes read from the body of an answer.
+#: Maximum number of bytes to read of the body of a response.
 _READ_BYTES: Final = 1024
-#: Prefixes that map IPv4 addresses: the well-known one, and network-specific ones.
+#: IPv6 prefixes of mapped IPv4 addresses: the well-known one, and network-specific ones.
 _NAT64: Final = ipaddress.ip_network("64:ff9b::/96")
 _LOCAL_NAT64: Final = ipaddress.ip_network("64:ff9b:1::/48")
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Networks = tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]
-#: Addresses that `ipaddress` counts as global although they are not public: of clouds (Azure's host, IBM's services),
-#: of protocols (RFC 6890, RFC 7526), of documentation (RFC 9637).
+#: Networks that are not public although `ipaddress` counts them as global: of clouds (Azure's host, IBM's services),
+#: protocols (RFC 6890, RFC 7526) and documentation (RFC 9637).
 _INSIDE: Final = tuple(
     ipaddress.ip_network(one)
     for one in ("168.63.129.16/32", "161.26.0.0/16", "166.8.0.0/14", "192.0.0.0/24", "192.88.99.0/24", "3fff::/20")
@@ -61,12 +60,12 @@ class RefusedAddress(InputError):
 
 @dataclass(frozen=True)
 class Response:
-    """Response to a delivery: a status, or a short reason for its absence."""
+    """Response to a delivery: HTTP status, None without a response; `detail` is a short text."""
 
     status: int | None
     detail: str = ""
     is_final: bool = False
-    """Whether a retry is useless because the address is refused."""
+    """Whether no retry follows, because the address is refused."""
 
     @property
     def is_accepted(self) -> bool:
@@ -74,7 +73,7 @@ class Response:
 
 
 def parse_networks(text: str) -> Networks:
-    """Parse networks of a setting, separated by commas or spaces; InputError for an invalid one."""
+    """Parse networks that are separated by commas or spaces; InputError for an invalid one."""
     try:
         return tuple(ipaddress.ip_network(one) for one in text.replace(",", " ").split())
     except ValueError as error:
@@ -82,10 +81,7 @@ def parse_networks(text: str) -> Networks:
 
 
 def is_public(address: Address) -> bool:
-    """Check whether an address is public; the IPv4 address within an IPv6 address decides.
-
-    Loopback, private, link-local, shared, multicast and reserved addresses are not public.
-    """
+    """Return whether an address, or the IPv4 address embedded in an IPv6 address, is public."""
     if any(address in network for network in _INSIDE):
         return False
     if isinstance(address, ipaddress.IPv6Address):
@@ -100,7 +96,7 @@ def is_public(address: Address) -> bool:
 
 
 def resolve_allowed_addresses(host: str, port: int, allowed: Networks) -> list[str]:
-    """Return a host's addresses; RefusedAddress unless all are public or in `allowed`, OSError if none."""
+    """Return a host's addresses; OSError without any, RefusedAddress if one is not public or `allowed`."""
     found = list(dict.fromkeys(str(info[4][0]) for info in _resolve_host(host, port)))
     for one in found:
         address = ipaddress.ip_address(one.partition("%")[0])
@@ -129,7 +125,7 @@ def _resolve_host(host: str, port: int) -> list[Any]:
 def post(
     url: str, body: bytes, headers: Mapping[str, str], *, allowed: Networks = (), patience_s: float = PATIENCE_S
 ) -> Response:
-    """Send a body and return the response; errors become responses without status."""
+    """Send a body and return the response; errors become responses without a status."""
     parts = urlsplit(url)
     host = parts.hostname or ""
     port = parts.port or (443 if parts.scheme == "https" else 80)
@@ -141,7 +137,7 @@ def post(
         return Response(None, str(error), is_final=True)
     except (OSError, ValueError):
         return Response(None, "the host of the address cannot be looked up")
-    # A socket's time-out restarts with each byte; this timer limits the whole exchange.
+    # The time-out of a socket restarts with each byte; this timer limits the whole exchange.
     end = threading.Timer(patience_s, connection.cut)
     end.daemon = True
     end.start()
@@ -159,7 +155,7 @@ def post(
 
 
 class _Connection(http.client.HTTPConnection):
-    """Connection to one of the checked addresses, within `patience_s`, without resolving the host again."""
+    """Connection to the first reachable of the checked addresses; the host is not resolved again."""
 
     def __init__(self, scheme: str, host: str, port: int, addresses: Sequence[str], patience_s: float) -> None:
         super().__init__(host, port)
@@ -173,7 +169,7 @@ class _Connection(http.client.HTTPConnection):
         self.sock = self._context.wrap_socket(dialled, server_hostname=self.host) if self._context else dialled
 
     def cut(self) -> None:
-        """Shut the open connection down, from another thread."""
+        """Shut the connection down, from another thread."""
         with contextlib.suppress(OSError):
             if self.sock is not None:
                 self.sock.shutdown(socket.SHUT_RDWR)
@@ -194,7 +190,7 @@ Post = Callable[..., Response]
 
 
 class WebhookDispatcher:
-    """Runs in parallel with the controller's rounds, so that a silent address delays nothing else."""
+    """Creates and starts deliveries, in a thread beside the controller's rounds."""
 
     def __init__(self, services: Services, stop: threading.Event, *, send: Post = post) -> None:
         self._services = services
@@ -214,7 +210,7 @@ class WebhookDispatcher:
     def run(self) -> None:
         look_again = -math.inf
         while not self._stop.is_set():
-            # An address gets one delivery at a time: the next starts when the last has ended.
+            # The end of a delivery starts the next one of its webhook at once.
             self._ended.wait(_PAUSE_S)
             self._ended.clear()
             try:
@@ -229,7 +225,7 @@ class WebhookDispatcher:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def start_deliveries(self, *, now: float | None = None) -> list[Future[None]]:
-        """Create deliveries of newly ended jobs and datasets, and start due ones while slots are free."""
+        """Create deliveries of newly ended jobs and datasets; start due ones while slots are free."""
         out = self._services.index.outbox
         if time.monotonic() > self._forget_again:
             out.forget_old()
@@ -249,7 +245,7 @@ class WebhookDispatcher:
         return started
 
     def _fair_order(self, found: list[DueDelivery]) -> list[DueDelivery]:
-        """Let projects (or keys without a project) take turns; within each, least recently used come first."""
+        """Order deliveries round-robin over projects (or keys), the least recently used webhooks first."""
         of_project: dict[str, list[DueDelivery]] = {}
         for due in sorted(found, key=lambda one: self._last.get(one.hook.id, (0.0, False))):
             of_project.setdefault(due.hook.project or f"key {due.hook.owner}", []).append(due)
@@ -291,10 +287,10 @@ class WebhookDispatcher:
             SIGNATURE: signature(secret_of(self._master, due.hook.id), at, body),
         }
         answer = self._send(due.hook.url, body, headers, allowed=self._allowed)
-        self._last[due.hook.id] = (time.monotonic(), not answer.is_accepted)
-        self._services.index.outbox.record_attempt(
-            due, status=answer.status, detail=answer.detail, done=answer.is_accepted, final=answer.is_final
-        )
+        done = answer.is_accepted
+        self._last[due.hook.id] = (time.monotonic(), not done)
+        outbox = self._services.index.outbox
+        outbox.record_attempt(due, status=answer.status, detail=answer.detail, done=done, final=answer.is_final)
 
 
 def body_of(end: EndView) -> bytes:

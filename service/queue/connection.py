@@ -21,7 +21,7 @@ _NETWORK: Final = {"socket_connect_timeout": 3.0, "socket_keepalive": True}
 
 
 def connect(url: str, *, patience: int = 3, timeout_s: float = _SOCKET_TIMEOUT_S) -> Redis:
-    """Return a client that reconnects; it gives up after `patience` attempts, each of `timeout_s` at most."""
+    """Return a client that reconnects up to `patience` times; each attempt takes at most `timeout_s` [s]."""
     over_network: dict[str, Any] = {} if url.startswith("unix:") else _NETWORK
     try:
         return Redis.from_url(
@@ -52,7 +52,7 @@ def redis_url(settings: Settings) -> str:
 
 
 def password(data_dir: Path) -> str:
-    """Return the password of a data folder's embedded Redis; "" if it has only its private socket."""
+    """Return the password of a data folder's embedded Redis; "" if it has none."""
     try:
         return password_file(data_dir).read_text().strip()
     except OSError:
@@ -64,7 +64,7 @@ def password_file(data_dir: Path) -> Path:
 
 
 def socket_path(data_dir: Path) -> Path:
-    """Return the socket's path of a data folder's Redis: in that folder, or if too long in a private one."""
+    """Return the socket of a data folder's Redis: in that folder, or if too long in a private one."""
     path = data_dir.resolve() / "redis" / "redis.sock"
     if len(os.fsencode(path)) <= _MAX_SOCKET_PATH:
         return path

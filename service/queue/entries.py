@@ -1,14 +1,12 @@
 """Entries in Redis: lists of waiting tasks, parsing of messages, jobs restricted to graspd's own task.
 
 Any client can write any value under any name. Unreadable entries are skipped; `remove_mistyped_keys` removes permanent
-obstacles. RQ imports and calls any function or callback of a job's hash, even with the JSON serializer. It posts to any
-webhook URL in the hash. A worker therefore rebuilds each job from its id and message only. It passes the message to its
-engine and calls nothing that the job names.
+obstacles. RQ calls any function or callback that a job's hash names, and posts to its webhook URL. A worker therefore
+rebuilds each job from its id and message only, and passes the message to its engine.
 
 There is one list per priority and stage, so that workers can serve selected stages. During an upgrade, a task that only
-some workers can do waits in a separate list. Its name ends in the requirements, `bulk-synthesize.2.10` for schema 2 and
-revision 10; other workers never read it. RQ defines the names of its keys. RQ's readers modify data, so read-only
-code reads the keys directly.
+some workers can do waits in a separate list. The name of this list ends in the requirements: `bulk-synthesize.2.10`
+means schema 2 and revision 10. RQ's readers modify data, so read-only code reads RQ's keys directly.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ import re
 import zlib
 from collections.abc import Collection, Iterable, Mapping
 from itertools import product
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, cast
 
 from pydantic import TypeAdapter, ValidationError
 from redis.exceptions import RedisError, ResponseError
@@ -51,7 +49,7 @@ def decode_text(raw: bytes | None) -> str:
 
 
 def task_of(job: str) -> tuple[str, int]:
-    """Return task id and attempt of an RQ job id; a forged id counts as a separate task."""
+    """Split an RQ job id into task id and attempt; a forged id counts as a task id with attempt 0."""
     match = _ATTEMPT.fullmatch(job)
     return (match[1], int(match[2])) if match else (job, 0)
 
@@ -73,8 +71,7 @@ def parse_message(data: bytes | None) -> Message | None:
 def parse_entry(kind: type[Entry], data: bytes | None) -> Entry | None:
     """Parse a worker's report or an event; None if it is malformed or of an incompatible version."""
     try:
-        found: Entry = _ADAPTERS[kind].validate_json(data or b"")
-        return found
+        return cast(Entry, _ADAPTERS[kind].validate_json(data or b""))
     except ValidationError:
         return None
 
@@ -91,7 +88,7 @@ def parse_events(reply: Any) -> list[tuple[str, Event | None]]:
 
 
 def remove_mistyped_keys(connection: Any, kinds: Mapping[str, str], stream: str) -> None:
-    """Remove keys of other types than in `key_types`, and an event stream that accepts no entries."""
+    """Remove keys whose type differs from `kinds`, and the event stream if it rejects new entries."""
     with connection.pipeline(transaction=False) as pipe:
         for name in kinds:
             pipe.type(name)
@@ -127,16 +124,16 @@ def checked_job(job: Job, queue: Queue) -> Job:
 
 
 def is_entry_error(error: Exception) -> bool:
-    """Check whether RQ took an entry but could not parse it: unreadable entries are discarded."""
+    """Return whether RQ removed an entry from a list but could not parse it."""
     if not hasattr(error, "job_id"):  # RQ sets job_id on errors of reading an entry's job.
         return isinstance(error, UnicodeDecodeError)
     return not isinstance(error, RedisError) or is_type_error(error)
 
 
-#: Sets of all lists ever used, and of all workers.
+#: Keys of RQ's sets of all lists ever used, and of all workers.
 LISTS: Final[str] = Queue.redis_queues_keys
 RQ_WORKERS: Final[str] = Worker.redis_workers_keys
-#: Later stages first: started batches are finished before the next one starts.
+#: Order in which a worker reads stages: later stages first, so that started batches finish before new ones start.
 _STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
 #: Maximum number of separate lists; further names are ignored.
 _MOST_APART: Final = 64
@@ -152,10 +149,7 @@ def queue_name(priority: Priority, stage: Stage, need: Requirements | None = Non
 
 
 def queue_names(stages: Collection[Stage], taken: int = 0, *, ability: Capabilities | None = None) -> list[str]:
-    """Return a worker's queues for these stages, in the order in which it reads them after `taken` tasks.
-
-    Separate lists come first, because other workers cannot serve them.
-    """
+    """Return a worker's queues in reading order after `taken` tasks, separate lists before common ones."""
     return [
         queue_name(priority, stage, need)
         for priority in priority_order(taken)
@@ -231,5 +225,5 @@ def execution_keys(entry: str) -> tuple[str, str]:
 
 
 def key_types(lists: list[str]) -> dict[str, str]:
-    of_each = ((list_key, "list"), (held_key, "zset"), (workers_key, "set"))
-    return {key(name): kind for name in lists for key, kind in of_each}
+    types = ((list_key, "list"), (held_key, "zset"), (workers_key, "set"))
+    return {key(name): kind for name in lists for key, kind in types}

@@ -14,9 +14,7 @@ from graspd.service.model.messages import Amount, Count, HostWord, IngestMessage
 from graspd.service.model.states import Priority, Stage
 
 Message = TaskMessage | IngestMessage
-
-
-#: For every n-th task, a worker looks in bulk first, so that steady interactive work does not block bulk work.
+#: For every n-th task, a worker reads bulk lists first, so that steady interactive work does not block bulk work.
 BULK_EVERY: Final = 4
 
 
@@ -34,7 +32,7 @@ class EventKind(StrEnum):
     FAILED = "failed"
     """An attempt failed and is recorded in the store."""
     DEFERRED = "deferred"
-    """A part of the service did not answer; the attempt does not count."""
+    """The worker could not run the task at present, for example without the store; the attempt does not count."""
     RETURNED = "returned"
     """A stopping worker returned the task; the attempt does not count."""
     CANCELLED = "cancelled"

@@ -1,7 +1,7 @@
 """Queue on Redis: RQ for tasks and leases, a bounded stream for events.
 
-Each pair of priority and stage has an RQ queue. RQ's own retries, scheduler, maintenance and result storage are
-unused: each loses or repeats work in ways that the controller does not.
+Each pair of priority and stage has an RQ queue. RQ's retries, scheduler, maintenance and result storage are unused,
+because they may lose or repeat tasks.
 """
 
 from __future__ import annotations
@@ -30,28 +30,11 @@ from graspd.service.model.renamed import message_for_revision
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue import entries
 from graspd.service.queue.connection import connect, redis_url
-from graspd.service.queue.entries import (
-    LISTS,
-    RQ_WORKERS,
-    execution_keys,
-    held_key,
-    job_key,
-    key_types,
-    list_key,
-    list_names,
-    new_job,
-    priority_and_stage_of,
-    queue_name,
-    rq_worker_key,
-    unserved_lists,
-    workers_key,
-)
 from graspd.service.queue.port import Event, Lease, Message, Place, QueueStatus
 from graspd.service.settings import Settings
 
 EVENTS: Final = "graspd:events"
-#: Maximum number of events (20 MB): a minute without a controller at four hundred tasks per second. Lost events are
-#: restored from the store.
+#: Maximum number of events (20 MB), enough for a minute without a controller at 400 tasks/s; the store restores others.
 EVENTS_KEPT: Final = 50_000
 #: Consumer group, named as in graspd 0.2, so that a controller continues where one of 0.2 ended.
 _GROUP: Final = "keeper"
@@ -75,7 +58,7 @@ class RqQueue:
         self.connection: Any = connection
         self._queues: dict[str, Queue] = {}
         self._unread = "0"
-        """Position up to which an earlier controller's pending events were read; ">" once all were read."""
+        """Id of the last pending event of an earlier controller that was read; ">" once all were read."""
         self._leases: dict[str, Any] = {}
 
     def ping(self) -> float:
@@ -88,19 +71,19 @@ class RqQueue:
     def enqueue(
         self, messages: Sequence[Message], priority: Priority, *, again: bool = False, apart: bool = False
     ) -> int:
-        """Append tasks that neither wait nor run to a priority's lists; return the number of appended tasks.
+        """Append tasks that neither wait nor run to the lists of a priority; return their number.
 
-        `again` replaces remaining data of tasks that the caller found missing. `apart` appends to the separate lists.
+        `again` first deletes the data that missing tasks left in Redis. `apart` selects the separate lists.
         """
         stale = [cancel_key(message.task_id) for message in messages]
         if again:
-            stale += [job_key(rq_id(message.task_id, message.attempt)) for message in messages]
+            stale += [entries.job_key(rq_id(message.task_id, message.attempt)) for message in messages]
         added = 0
         with _convert_errors():
             if stale:
                 self.connection.delete(*stale)
             for message in messages:
-                name = queue_name(priority, message.stage, requirements_of(message) if apart else None)
+                name = entries.queue_name(priority, message.stage, requirements_of(message) if apart else None)
                 if name not in self._queues:
                     self._queues[name] = Queue(name, self.connection, serializer=JSONSerializer)
                 with suppress(DuplicateJobError):
@@ -119,7 +102,7 @@ class RqQueue:
                 for job in self.connection.lrange(key, 0, -1):
                     if entries.task_of(entries.decode_text(job))[0] in wanted:
                         pipe.lrem(key, 0, job)
-                        pipe.delete(job_key(entries.decode_text(job)))
+                        pipe.delete(entries.job_key(entries.decode_text(job)))
             pipe.execute()
 
     def waiting(self) -> set[str]:
@@ -130,33 +113,33 @@ class RqQueue:
 
     def depths(self) -> dict[tuple[Priority, Stage], int]:
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
-            lists = list_names(self.connection)
+            lists = entries.list_names(self.connection)
             for name in lists:
-                pipe.llen(list_key(name))
+                pipe.llen(entries.list_key(name))
             depths: Counter[tuple[Priority, Stage]] = Counter()
             for name, length in zip(lists, pipe.execute(), strict=True):
-                depths[priority_and_stage_of(name)] += length
+                depths[entries.priority_and_stage_of(name)] += length
             return dict(depths)
 
     def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
-        """Remove separate lists without capable workers; the controller then finds their tasks missing."""
+        """Remove separate lists that no worker can serve; the controller queues their tasks again."""
         abilities = [(stage, beat.capabilities) for beat in present for stage in beat.stages]
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
-            for name in unserved_lists(list_names(self.connection), abilities):
-                key = list_key(name)
+            for name in entries.unserved_lists(entries.list_names(self.connection), abilities):
+                key = entries.list_key(name)
                 for job in self.connection.lrange(key, 0, -1):
-                    pipe.delete(job_key(entries.decode_text(job)))
+                    pipe.delete(entries.job_key(entries.decode_text(job)))
                 pipe.delete(key)
                 # Leases of running tasks are read under the list's name.
-                if not self.connection.exists(held_key(name)):
-                    pipe.srem(LISTS, key)
+                if not self.connection.exists(entries.held_key(name)):
+                    pipe.srem(entries.LISTS, key)
             pipe.execute()
 
     def leases(self) -> list[Lease]:
         """Return the leases of all workers, living or dead; reading changes nothing."""
         # RQ's own readers also move lost tasks and run callbacks, so the keys are read directly.
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
-            keys = [held_key(name) for name in list_names(self.connection)]
+            keys = [entries.held_key(name) for name in entries.list_names(self.connection)]
             for key in keys:
                 pipe.zrange(key, 0, -1, withscores=True)
             found = pipe.execute()
@@ -168,9 +151,9 @@ class RqQueue:
         ]
 
     def holder(self, lease: Lease) -> tuple[str, Message | None]:
-        """Return worker and message of a lost lease; "" and None for data that Redis has lost."""
+        """Return worker and message of a lost lease; "" or None if Redis has lost the data."""
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
-            pipe.hmget(job_key(entries.decode_text(lease.key[1].partition(b":")[0])), "worker_name", "data")
+            pipe.hmget(entries.job_key(entries.decode_text(lease.key[1].partition(b":")[0])), "worker_name", "data")
             (found,) = pipe.execute(raise_on_error=False)  # The name may have a value of another type.
         worker, data = (None, None) if isinstance(found, Exception) else found
         return entries.decode_text(worker), entries.parse_message(data)
@@ -181,7 +164,7 @@ class RqQueue:
         name = entries.decode_text(entry)
         with _convert_errors(), self.connection.pipeline(transaction=True) as pipe:
             pipe.zrem(key, entry)
-            pipe.delete(*execution_keys(name), job_key(name.partition(":")[0]))
+            pipe.delete(*entries.execution_keys(name), entries.job_key(name.partition(":")[0]))
             pipe.execute()
 
     def workers(self) -> list[WorkerBeat]:
@@ -198,7 +181,7 @@ class RqQueue:
             pipe.execute()
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Return the next events for the controller, oldest first; unacknowledged ones are delivered again."""
+        """Return the next events with their ids, oldest first, after those an earlier controller left."""
         with _convert_errors():
             while self._unread != ">":
                 pending = self._read_group(self._unread, limit, 0.0)
@@ -213,13 +196,13 @@ class RqQueue:
                 self.connection.xack(EVENTS, _GROUP, *event_ids)
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Return events after an id, for any number of readers; `"$"` means future ones only, `"0"` all."""
+        """Return the events after an id, for any number of readers; `"$"`: only future events, `"0"`: all."""
         with _convert_errors():
             found = self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
         return [(event_id, event) for event_id, event in entries.parse_events(found) if event is not None]
 
     def announce(self, part: str, seconds: float) -> None:
-        """Announce that a part of the service (the controller) lives, for some seconds."""
+        """Register a part of the service (the controller) as running for some seconds."""
         with _convert_errors():
             self.connection.set(_part_key(part), "1", px=int(seconds * 1000))
 
@@ -234,7 +217,7 @@ class RqQueue:
         return None if found is None else entries.decode_text(found)
 
     def set_service(self, identity: str, *, instead: bool = False) -> None:
-        """Set the identity of the owning service, if it is unset or `instead` is given."""
+        """Set the identity of the owning service; an existing one is replaced only with `instead`."""
         with _convert_errors():
             self.connection.set(_SERVICE, identity, nx=not instead)
 
@@ -265,25 +248,24 @@ class RqQueue:
             self.connection.lock(LEAD).do_release(holder)
 
     def status(self, *, lease_s: float) -> QueueStatus:
-        """Return queue lengths, ages and workers for the metrics, at a cost independent of the queue's length."""
+        """Return queue lengths, ages [s] and workers for the metrics, in constant time per list."""
         beats = self.workers()
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
-            lists = list_names(self.connection)
+            lists = entries.list_names(self.connection)
             for name in lists:
-                pipe.llen(list_key(name))
-                pipe.lindex(list_key(name), 0)
-                pipe.zcard(held_key(name))
+                pipe.llen(entries.list_key(name))
+                pipe.lindex(entries.list_key(name), 0)
+                pipe.zcard(entries.held_key(name))
             found = pipe.execute()
             for head in found[1::3]:
-                pipe.hget(job_key(entries.decode_text(head)), "enqueued_at")
+                pipe.hget(entries.job_key(entries.decode_text(head)), "enqueued_at")
             for beat in beats:
                 pipe.pttl(worker_key(beat.name))
             # A name may have a forged value of any type, which must not hide the others.
             since = [None if isinstance(one, Exception) else one for one in pipe.execute(raise_on_error=False)]
         depth, running, oldest = Counter[Place](), Counter[Place](), dict[Place, float]()
-        for place, waiting, held, when in zip(
-            map(priority_and_stage_of, lists), found[0::3], found[2::3], since, strict=False
-        ):
+        places = map(entries.priority_and_stage_of, lists)
+        for place, waiting, held, when in zip(places, found[0::3], found[2::3], since, strict=False):
             depth[place] += waiting
             running[place] += held
             if (age := age_of(entries.decode_text(when))) is not None:
@@ -310,18 +292,18 @@ class RqQueue:
         return sums
 
     def tidy(self) -> None:
-        # RQ cleans its registries of workers in its own maintenance, which is off.
+        """Remove keys of wrong types, and the registrations of dead workers, which RQ leaves."""
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
-            lists = list_names(self.connection)
-            entries.remove_mistyped_keys(self.connection, {**_KINDS, **key_types(lists)}, EVENTS)
+            lists = entries.list_names(self.connection)
+            entries.remove_mistyped_keys(self.connection, {**_KINDS, **entries.key_types(lists)}, EVENTS)
             known = list(self.connection.smembers(WORKERS))
             for name in known:
                 pipe.exists(_WORKER + name)
             for name, lives in zip(known, pipe.execute(), strict=True):
                 if not lives:
-                    key = rq_worker_key(entries.decode_text(name))
+                    key = entries.rq_worker_key(entries.decode_text(name))
                     pipe.delete(key)
-                    for registry in (RQ_WORKERS, *map(workers_key, lists)):
+                    for registry in (entries.RQ_WORKERS, *map(entries.workers_key, lists)):
                         pipe.srem(registry, key)
                     pipe.srem(WORKERS, name)
             pipe.execute()
@@ -349,7 +331,7 @@ class RqQueue:
 
     def _job(self, message: Message) -> Job:
         data = message.model_dump(mode="json", by_alias=True)
-        return new_job(
+        return entries.new_job(
             message_for_revision(getattr(message, "revision", 0), message.stage, data),
             id=rq_id(message.task_id, message.attempt),
             connection=self.connection,
@@ -357,7 +339,7 @@ class RqQueue:
         )
 
     def _list_keys(self) -> list[str]:
-        return [list_key(name) for name in list_names(self.connection)]
+        return [entries.list_key(name) for name in entries.list_names(self.connection)]
 
 
 def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
@@ -370,7 +352,7 @@ def put_event(pipe: Any, event: Event) -> None:
 
 
 def rq_id(task_id: str, attempt: int) -> str:
-    """Return RQ's job id: one per task and attempt, so that a slow worker cannot affect a later attempt."""
+    """Return the RQ job id of an attempt; a slow worker thus cannot affect a later attempt."""
     return f"{task_id}-{attempt}"
 
 
@@ -379,7 +361,7 @@ def cancel_key(task_id: str) -> str:
 
 
 def lease_state(connection: Any, job: Job, execution: Execution) -> tuple[bool, bool]:
-    """Return whether the worker has a task's lease, and whether the task is cancelled; change nothing."""
+    """Return whether the worker still has the lease of its task, and whether the task is cancelled."""
     with connection.pipeline(transaction=False) as pipe:
         pipe.zscore(job.started_job_registry.key, execution.composite_key)
         pipe.exists(cancel_key(entries.task_of(job.id)[0]))
@@ -402,7 +384,7 @@ def register_worker(connection: Any, beat: Mapping[str, Any], lease_s: float) ->
 
 
 def unregister_worker(connection: Any, left: Event) -> None:
-    """End a worker's registration and append the event of its end."""
+    """Remove a worker's registration and append its event `left`."""
     with connection.pipeline() as pipe:
         pipe.delete(worker_key(left.worker))
         pipe.srem(WORKERS, left.worker)
@@ -420,7 +402,7 @@ def _part_key(part: str) -> str:
 
 _KINDS: Final = {
     **dict.fromkeys((LEAD, _SERVICE), "string"),
-    **dict.fromkeys((WORKERS, RQ_WORKERS, LISTS), "set"),
+    **dict.fromkeys((WORKERS, entries.RQ_WORKERS, entries.LISTS), "set"),
     EVENTS: "stream",
     METRICS: "hash",
 }
@@ -431,5 +413,6 @@ def _convert_errors() -> Iterator[None]:
     try:
         yield
     except (RedisError, OSError) as error:
-        said = f"Redis does not answer ({first_line(error)}); start `graspd up`, or set GRASPD_REDIS_URL"
-        raise QueueUnavailable(said) from None
+        raise QueueUnavailable(
+            f"Redis does not answer ({first_line(error)}); start `graspd up`, or set GRASPD_REDIS_URL"
+        ) from None

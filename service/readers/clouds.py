@@ -1,8 +1,9 @@
-"""Labelled point clouds from pictures, with perfect or simulated camera depth; clouds are not stored."""
+"""Labelled point clouds of pictures, from true depth or the depth of a simulated camera."""
 
 from __future__ import annotations
 
 import hashlib
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Final, Literal
@@ -27,7 +28,7 @@ FRAMES: Final[tuple[Frame, ...]] = ("camera", "table", "object")
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Prefixes of the keys with one row per grasp.
 OF_GRASPS: Final = ("pregrasp/", "grasp/", "squeeze/", "quality/")
-#: Largest distance of a contact between the hand's surface and a point [m]: the middle contact threshold of shards.
+#: Largest distance between hand and point at a contact [m]: the middle contact threshold of shards.
 TOUCH_M: Final = 0.005
 
 
@@ -36,17 +37,16 @@ class Clouds(Sequence[dict[str, Any]]):
 
         cloud/points (P, 3) [m]; cloud/normals (P, 3), unit, toward the camera that saw the point
         cloud/object (P,) 1 where the pixel shows the object; cloud/pixel (P, 3): view, row, column
-        cloud/seen: number of visible points; if fewer than P, some points repeat; if none, all values are zero
+        cloud/seen: number of visible points. If fewer than P, some points repeat; if 0, all values are zero
         cloud/graspness (P,), optional: share of the scene's K grasps whose hand touches the point
         camera/intrinsics (3, 3) K [px], camera/extrinsics (4, 4) E, table to camera; for fused views (V, ...)
         table/plane (4,) n and d of n.x = d, the table's top; table/height [m] of the top along n in the table's frame
-        object/pose (7,): pose of the object's frame
+        object/pose (7,) of the object's frame
         grasp/hand_pose (K, 7), likewise for other `postures`; grasp/joint_positions (K, J)
         grasp/hand_pose_camera (not for fused views), grasp/hand_pose_table, grasp/hand_pose_object in these frames
         grasp/base_row (K,), base_id, and the columns of `grasp_quality` of the pictures
 
-    Points, plane and poses are in `frame`. `pictures` selects the grasps: by default valid ones that are clear in the
-    scene.
+    Points, plane and poses are in `frame`. `pictures` selects the grasps, by default valid grasps clear in the scene.
     """
 
     def __init__(
@@ -81,15 +81,11 @@ class Clouds(Sequence[dict[str, Any]]):
         """
         chosen = frame or ("table" if fuse else "camera")
         if chosen not in FRAMES or (fuse and chosen == "camera"):
-            raise InputError(
-                f"clouds {'of several views ' * fuse}cannot be in the frame {chosen!r}; choose table or object"
-            )
+            raise InputError(f"clouds {'of several views ' * fuse}have no frame {chosen!r}; choose table or object")
         if unknown := set(postures) - set(POSTURES):
             raise InputError(f"there is no posture {sorted(unknown)[0]!r}; choose from {', '.join(POSTURES)}")
         if points < 1 or voxel_m < 0 or touch_m <= 0 or seed < 0:
-            raise InputError(
-                "clouds need points of at least 1, voxel_m of at least 0, touch_m above 0 and seed of at least 0"
-            )
+            raise InputError("clouds need points >= 1, voxel_m >= 0, touch_m > 0 and seed >= 0")
         self.pictures, self.points, self.frame, self.epoch = pictures, points, chosen, 0
         self._noise, self._whole, self._voxel, self._seed = noise_of(noise), scene, voxel_m, seed
         self._postures, self._surface, self._touch = tuple(postures), hand_surface, touch_m
@@ -113,8 +109,8 @@ class Clouds(Sequence[dict[str, Any]]):
             touched = self._graspness(views, sample["cloud/pixel"], scenes, first.scene)
             sample["cloud/graspness"] = np.where(sample["cloud/object"] == 1, touched, 0.0).astype(np.float32)
         for name in ("camera/intrinsics", "camera/extrinsics"):
-            stacked = np.stack([view.columns[name] for view in views])
-            sample[name] = stacked if self._fused else stacked[0]
+            matrices = [view.columns[name] for view in views]
+            sample[name] = np.stack(matrices) if self._fused else matrices[0]
         normal = transforms.quat_rotate(into[3:], np.array([0.0, 0.0, 1.0]))
         sample |= {"table/plane": np.append(normal, normal @ into[:3]), "table/height": 0.0}
         sample["object/pose"] = transforms.compose(into, object_pose)
@@ -142,7 +138,7 @@ class Clouds(Sequence[dict[str, Any]]):
         return cloud | {"cloud/seen": seen}
 
     def _graspness(self, views: Sequence[CloudView], pixel: Ints, scenes: Scenes, scene: int) -> Floats:
-        """Compute graspness at the points without noise: noise changes measured points, not contacts."""
+        """Compute graspness (P,) at the true points of the pixels, because noise does not change contacts."""
         assert self._surface is not None
         points = _gather(views, pixel, CloudView.true_points)
         on_object = transforms.apply(transforms.invert(scenes.object_pose(scene)), points)
@@ -175,9 +171,9 @@ class Clouds(Sequence[dict[str, Any]]):
 
 
 def _by_scene(places: Sequence[PictureAddress]) -> list[list[PictureAddress]]:
-    found: dict[tuple[str, int], list[PictureAddress]] = {}
+    found: dict[tuple[str, int], list[PictureAddress]] = defaultdict(list)
     for place in places:
-        found.setdefault((place.file.id, place.scene), []).append(place)
+        found[place.file.id, place.scene].append(place)
     return list(found.values())
 
 
@@ -196,7 +192,7 @@ def _voxels(points: Floats, edge: float, draw: np.random.Generator) -> Ints:
 
 
 def _seed_words(place: PictureAddress) -> tuple[int, int]:
-    """Return seed words from hand, object, batch and row of a picture, not from its file name."""
+    """Return two seed words of a picture from hand, object, batch and row, independent of its file."""
     name = f"{place.file.hand}/{place.file.object}/{place.file.batch}"
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]), place.row
 
@@ -204,9 +200,9 @@ def _seed_words(place: PictureAddress) -> tuple[int, int]:
 def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOUCH_M) -> Floats:
     """Compute the share of the grasps whose hand touches each point.
 
-    Wang et al. 2021 (Graspness Discovery in Clutters, eq. 1) count poses of a parallel gripper, sampled around each
-    point, that hold and are clear. A multi-finger hand touches several places, and its grasps are optimised. Here
-    graspness counts the valid grasps of a scene that touch the point.
+    Wang et al. 2021 (Graspness Discovery in Clutters, eq. 1) count sampled poses of a parallel gripper around a point
+    that hold and are clear. Here graspness counts the valid grasps of a scene that touch the point, because grasps of a
+    multi-finger hand touch several places and are optimised.
 
     Args:
         points: (P, 3) in the object's frame [m].
@@ -235,15 +231,15 @@ def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOU
 
 COLUMNS: Final = ("image/depth", "image/segmentation", "camera/intrinsics", "camera/extrinsics")
 _OBJECT: Final = 2
-#: Planes are fitted to noisy points in windows of 7 x 7 pixels; the depth may differ by this many deviations.
+#: Planes are fitted to noisy points in windows of 7 x 7 pixels, within this number of standard deviations of depth.
 _RADIUS: Final = 3
 _DEVIATIONS: Final = 4.0
-#: Steepest surface in a window: the ratio of depth to lateral distance is at most this.
+#: Largest ratio of depth to lateral distance on the surface in a window.
 _SLOPE: Final = 3.0
 
 
 class CloudView:
-    """Columns `COLUMNS` of one picture, and its depth as measured by a camera; `draw` generates the noise."""
+    """Columns `COLUMNS` of one picture, and its depth as a camera measures it; `draw` generates the noise."""
 
     def __init__(self, columns: Mapping[str, Array], noise: DepthNoise | None, draw: np.random.Generator) -> None:
         self.columns, self._noise = columns, noise

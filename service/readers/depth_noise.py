@@ -10,8 +10,8 @@
 | shadows | regions hidden from the second eye or the projector | geometry; left-right check |
 | holes | angles beyond 80 degrees; disparity beyond the search range; a random share | Nguyen, Intel |
 
-Not modelled: materials (glass, mirrors, black), interference between cameras, multipath light, distorted calibration,
-and correlated errors of neighbouring pixels.
+Not modelled: materials (glass, mirrors, black), interference between cameras, multipath light, wrong calibration,
+correlated errors of neighbouring pixels.
 
 Sources: Nguyen, Izadi, Lovell 2012, Modeling Kinect Sensor Noise (3DIMPVT), eq. 1-4; Khoshelham, Elberink 2012,
 Accuracy and Resolution of Kinect Depth Data (Sensors 12); Handa et al. 2014, A Benchmark for RGB-D Visual Odometry
@@ -39,7 +39,7 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """Model of a depth camera. Lengths in pixels refer to its own sensor and are scaled to the picture."""
+    """Model of a depth camera. Lengths in pixels refer to the sensor and are scaled to the picture."""
 
     focal_px: float
     """Focal length of the sensor [px]."""
@@ -96,7 +96,7 @@ class DepthNoise:
         Args:
             depth: (H, W) true depth along the axis [m]; not finite: no surface.
             k: (3, 3) intrinsics of the picture [px].
-            draw: random generator; the same generator gives the same picture.
+            draw: random generator; equal states give equal pictures.
             angle: (H, W) angle of incidence [rad], if already computed.
         """
         true = np.where(np.isfinite(depth), np.asarray(depth, float), np.nan)
@@ -140,7 +140,7 @@ def shadows(depth: Floats, focal_baseline: float) -> Bools:
     """Find the pixels (H, W) hidden from the right eye; disparity [px] is `focal_baseline` [px m] / depth.
 
     Each pixel is projected into the other picture, which shows the nearest surface. A pixel is hidden if it is more
-    than one pixel of disparity behind that surface (as in a left-right check), or outside the picture.
+    than 1 px of disparity behind that surface (as in a left-right check), or outside the other picture.
     """
     height, width = depth.shape
     with np.errstate(divide="ignore"):

@@ -1,4 +1,4 @@
-"""Location of shards: local files, or a job or snapshot in a store, whose files are cached."""
+"""Shards of local files, or of a job or snapshot in a store, with a cache of downloaded files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 import os
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -30,7 +30,7 @@ _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 
 @dataclass(frozen=True)
 class ShardFile:
-    """Local file under `path`, or file of a store under `key`."""
+    """Shard in a local file (`path`) or in a store (`key`)."""
 
     id: str
     kind: ShardKind
@@ -43,7 +43,7 @@ class ShardFile:
 
 
 class ShardCache:
-    """Files of a store, named by their SHA-256 and verified on download. Processes may share a folder."""
+    """Cache of a store's files, named by SHA-256 and verified on download. Processes may share a folder."""
 
     def __init__(self, folder: Path, *, limit_bytes: int = DEFAULT_BYTES) -> None:
         self.folder, self.limit_bytes, self._process = folder, limit_bytes, os.getpid()
@@ -56,7 +56,7 @@ class ShardCache:
         self.__dict__.update(state, _process=os.getpid())
 
     def fetch(self, store: Store, key: str, sha256: str) -> Path:
-        """Return the local path of a store's file, downloaded if needed; DamagedShard if missing or damaged."""
+        """Return the path of the cached file, downloaded if needed; DamagedShard if missing or damaged."""
         path = self.folder / f"{sha256}.h5"
         if not self._is_intact(path, sha256):
             write_atomically(path, self._checked(store, key, sha256))
@@ -67,21 +67,17 @@ class ShardCache:
     def _is_intact(path: Path, sha256: str) -> bool:
         try:
             check_content(path, sha256)
-            facts = path.stat()
-            # Marks the file as recently used. The modification time is unchanged, because it marks the file as
-            # verified.
-            os.utime(path, ns=(time.time_ns(), facts.st_mtime_ns))
+            # A new access time marks the file as recently used; the old modification time marks it as verified.
+            os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
         except (FileNotFoundError, DamagedShard):
             return False
         return True
 
     def _checked(self, store: Store, key: str, sha256: str) -> Iterator[bytes]:
-        # Requests to a remote store never return in a fork.
+        # In a fork, requests to a remote store never return.
         if os.getpid() != self._process and not store.url.startswith(("file:", "memory:")):
-            raise InputError(
-                f"{store.url} cannot be read in a fork of the process that opened it; "
-                "start new processes: DataLoader(..., multiprocessing_context='spawn')"
-            )
+            fix = "start new processes: DataLoader(..., multiprocessing_context='spawn')"
+            raise InputError(f"{store.url} cannot be read in a fork of the process that opened it; {fix}")
         digest = hashlib.sha256()
         try:
             for chunk in store.stream(key):
@@ -120,17 +116,14 @@ class Shards:
         return self._by_id[shard]
 
     def only(self, *, hands: Iterable[str] = (), objects: Iterable[str] = ()) -> Shards:
-        """Select the shards of some hands and objects; by default all."""
+        """Select the shards of some hands and objects, by default of all."""
         of_hands, of_objects = set(hands), set(objects)
-        kept = (
-            file
-            for file in self.files
-            if (not of_hands or file.hand in of_hands) and (not of_objects or file.object in of_objects)
-        )
-        return Shards(tuple(kept), self.store, self.cache)
+        found = [file for file in self.files if not of_hands or file.hand in of_hands]
+        found = [file for file in found if not of_objects or file.object in of_objects]
+        return replace(self, files=tuple(found))
 
     def path(self, file: ShardFile) -> Path:
-        """Return the local file, downloaded if necessary; DamagedShard if it does not match its checksum."""
+        """Return the path of the local or downloaded file; DamagedShard if it is damaged."""
         if file.path is not None:
             check_file(file.path)
             return file.path
@@ -150,10 +143,10 @@ def open_shards(
     """Find the shards of a folder (searched recursively), of files, or of a job or dataset in a store.
 
     Args:
-        source: a folder, a file, several of them, or a store or its URL (`file://`, `s3://`, `gs://`, `az://`).
-        job: id of a job in the store; selects its finished shards.
-        dataset: name of a dataset in the store; selects the shards of its newest snapshot.
-        snapshot: digest of another snapshot of that dataset.
+        source: one or several folders and files, or a store or its URL (`file://`, `s3://`, `gs://`, `az://`).
+        job: id of a job in the store, for its finished shards.
+        dataset: name of a dataset in the store, for the shards of its newest snapshot.
+        snapshot: digest of another snapshot of the dataset.
         cache: folder for files of a store; by default `$XDG_CACHE_HOME/graspd/shards`.
         cache_bytes: size limit of the cache [bytes].
 
@@ -165,9 +158,8 @@ def open_shards(
     """
     if isinstance(source, Store) or (isinstance(source, str) and "://" in source):
         store = source if isinstance(source, Store) else open_store(source, make=False)
-        found = _shards_of_store(store, job, dataset, snapshot)
-        kept = ShardCache(cache or cache_folder("shards"), limit_bytes=cache_bytes)
-        return Shards(_ordered(found), store, kept)
+        found = _ordered(_shards_of_store(store, job, dataset, snapshot))
+        return Shards(found, store, ShardCache(cache or cache_folder("shards"), limit_bytes=cache_bytes))
     given = [source] if isinstance(source, str | Path) else list(source)
     return Shards(_ordered(_shard_file(path) for entry in given for path in _paths(Path(entry))))
 
@@ -175,7 +167,7 @@ def open_shards(
 def _paths(entry: Path) -> list[Path]:
     if entry.is_dir():
         found = sorted(entry.rglob("*.h5"))
-        if next(entry.rglob("*.pack"), None) is not None:
+        if any(entry.rglob("*.pack")):
             raise InputError(f"{entry} has shards in {PACKED}")
         if not found:
             raise NotFoundError(f"{entry} contains no .h5 file")
@@ -187,11 +179,10 @@ def _paths(entry: Path) -> list[Path]:
 
 def _shard_file(path: Path) -> ShardFile:
     with open_shard(path) as file:
-        kind, said = kind_of(file, str(path)), dict(file.attrs)
-    name = str(said.get("shard_id", path.resolve()))
-    return ShardFile(
-        name, kind, str(said.get("hand", "")), str(said.get("object", "")), int(said.get("batch", 0)), path=path
-    )
+        kind, attributes = kind_of(file, str(path)), dict(file.attrs)
+    name = str(attributes.get("shard_id", path.resolve()))
+    hand, obj = (str(attributes.get(key, "")) for key in ("hand", "object"))
+    return ShardFile(name, kind, hand, obj, int(attributes.get("batch", 0)), path=path)
 
 
 def _shards_of_store(store: Store, job: str | None, dataset: str | None, snapshot: str | None) -> Iterator[ShardFile]:
@@ -216,8 +207,7 @@ def _shards_of_job(store: Store, job: str) -> Iterator[ShardFile]:
 
 
 def _shards_of_snapshot(store: Store, dataset: str, digest: str | None) -> Iterator[ShardFile]:
-    taken = newest_snapshot(store, dataset, digest)
-    for shard in taken.shards:
+    for shard in newest_snapshot(store, dataset, digest).shards:
         yield ShardFile(shard.id, shard.kind, shard.hand, shard.object, shard.batch, key=shard.key, sha256=shard.sha256)
 
 

@@ -38,7 +38,7 @@ _KEPT: Final = 256
 class Grasps(Sequence[dict[str, Any]]):
     """Grasps of base shards; `grasps[i]` is a dict of column rows and `hand`, `object`, `shard_id`, `row`.
 
-    Columns are described in docs/reference/dataset.md; swept metrics have one value per contact threshold of the shard.
+    docs/reference/dataset.md describes the columns. Swept metrics have one value per contact threshold of the shard.
     """
 
     def __init__(
@@ -50,10 +50,10 @@ class Grasps(Sequence[dict[str, Any]]):
         unvalidated: bool = False,
         where: Where | None = None,
     ) -> None:
-        """Read every base shard once to select the rows.
+        """Read every base shard once, to select the rows.
 
         Args:
-            shards: see `open_shards`; scene and views shards are ignored.
+            shards: result of `open_shards`; only base shards count.
             columns: columns of a sample.
             valid: select only valid grasps: feasible and held by a validator.
             unvalidated: select instead only feasible grasps without validation.
@@ -67,7 +67,7 @@ class Grasps(Sequence[dict[str, Any]]):
         self._files = shards.of("base")
         self._memory: OrderedDict[str, dict[str, Array]] = OrderedDict()
         self._rows = [self._selected_rows(file) for file in self._files]
-        #: (shards,) end index of each base shard's grasps.
+        #: (shards,) index after the last grasp of each base shard.
         self.ends = np.cumsum([len(rows) for rows in self._rows], dtype=np.int64)
 
     def __len__(self) -> int:
@@ -95,7 +95,7 @@ class Grasps(Sequence[dict[str, Any]]):
         raise InputError(f"no shard is of the hand {hand!r}")
 
     def arrays(self, *columns: str) -> dict[str, Array]:
-        """Return columns of all grasps, by default those of samples; InputError unless they fit in one array."""
+        """Return columns of all grasps, by default `columns`; InputError unless they fit into one array."""
         wanted = columns or self.columns
         parts: dict[str, list[Array]] = {name: [] for name in (*wanted, "hand", "object")}
         for file, rows in zip(self._files, self._rows, strict=True):
@@ -107,9 +107,8 @@ class Grasps(Sequence[dict[str, Any]]):
         try:
             return {name: np.concatenate(some) if some else np.empty(0) for name, some in parts.items()}
         except ValueError as error:
-            raise InputError(
-                f"the shards do not fit into one array ({error}); read one hand: shards.only(...)"
-            ) from None
+            hint = "read one hand: shards.only(...)"
+            raise InputError(f"the shards do not fit into one array ({error}); {hint}") from None
 
     def _selected_rows(self, file: ShardFile) -> NDArray[np.intp]:
         held = self._load(file, tuple(SCHEMAS["base"]) if self._where else validity.COLUMNS, keep=False)
@@ -126,8 +125,7 @@ class Grasps(Sequence[dict[str, Any]]):
 
     def _load(self, file: ShardFile, columns: Sequence[str], *, keep: bool = True) -> dict[str, Array]:
         held = self._memory.get(file.id, {})
-        missing = [name for name in columns if name not in held]
-        if missing:
+        if missing := [name for name in columns if name not in held]:
             with open_shard(self.shards.path(file)) as opened:
                 held = held | {name: read_column(opened, name, file.id) for name in missing if name in opened}
             may_lack = {name for name, column in SCHEMAS["base"].items() if column.optional and not keep}

@@ -53,15 +53,14 @@ class PictureAddress:
 class Pictures(Sequence[dict[str, Any]]):
     """Pictures of views shards. `pictures[i]` is a dictionary of column rows and the grasps of its scene.
 
-    The grasps are arrays of K rows; K differs between scenes and may be 0:
+    The grasps are arrays of K rows, where K differs between scenes and may be 0:
 
         grasp/hand_pose (K, 7) in the camera frame [m], quaternion w x y z
         grasp/joint_positions (K, J) [rad or m]
         grasp/base_row (K,) row in the base shard `base_id`
         quality/epsilon and other `grasp_quality` columns (K, ...)
 
-    `object/pose` (7,) is the pose of the object's frame in the camera frame. In a stereo pair the left picture comes
-    first.
+    `object/pose` (7,) is the pose of the object in the camera frame. The left picture of a stereo pair comes first.
     """
 
     def __init__(
@@ -84,7 +83,7 @@ class Pictures(Sequence[dict[str, Any]]):
             unvalidated: select instead only feasible grasps without validation.
             with_grasps_only: omit pictures of scenes without a grasp.
 
-        Raises InputError for an unknown column, NotFoundError if the scene or base shard of a views shard is missing.
+        Raises InputError for an unknown column, NotFoundError for a missing scene or base shard.
         """
         check_known("views", columns)
         check_known("base", grasp_quality)
@@ -121,12 +120,10 @@ class Pictures(Sequence[dict[str, Any]]):
     def _add(self, file: ShardFile, *, with_grasps_only: bool) -> None:
         with open_shard(self.shards.path(file)) as opened:
             scenes = np.asarray(opened["camera/scene_index"])
-            # The base shard contains the scenes of grasps planned in scenes.
+            # For grasps planned in scenes, the base shard contains the scenes.
             scene_shard = str(opened.attrs.get("base_shard") or opened.attrs.get("scene_shard") or "")
             if not scene_shard:
-                raise InputError(
-                    f"shard {file.id} does not name the shard of its scenes; render the pictures again: graspd render"
-                )
+                raise InputError(f"shard {file.id} lacks the name of its scene shard; render it again: graspd render")
             if absent := [name for name in self.columns if name not in opened]:
                 raise InputError(f"shard {file.id[:12]} of {file.object} has no column {absent[0]!r}")
         held = self.scenes_of(scene_shard)
@@ -137,7 +134,7 @@ class Pictures(Sequence[dict[str, Any]]):
     def _table(self, file: ShardFile, columns: Sequence[str]) -> RowTable:
         table = self._tables.get(file.id)
         known = table.columns if table else set()
-        if table is None or not known.issuperset(columns):
+        if table is None or not known >= set(columns):
             with open_shard(self.shards.path(file)) as opened:
                 table = RowTable.of(opened, {*columns, *known}, str(file.path or file.key))
             self._tables[file.id] = table
@@ -147,7 +144,7 @@ class Pictures(Sequence[dict[str, Any]]):
 
     def scenes_of(self, shard: str) -> Scenes:
         found = self._scenes.get(shard)
-        if found is None:  # Concurrent threads may both build the scenes, with equal results.
+        if found is None:  # Concurrent threads may both read the scenes, with equal results.
             found = self._scenes[shard] = Scenes(self.shards, shard, self._quality, **self._which)
             if len(self._scenes) > _KEPT:
                 self._scenes.popitem(last=False)
@@ -167,8 +164,7 @@ class Scenes:
         scenes = read_shard(shards.path(file), kind=file.kind)
         planned = file.kind == "base"
         self.base_id = shard if planned else str(scenes.attributes["base_shard"])
-        base = scenes if planned else read_shard(shards.path(shards.by_id(self.base_id)), kind="base")
-        self.base = base
+        self.base = base = scenes if planned else read_shard(shards.path(shards.by_id(self.base_id)), kind="base")
         self._object = np.asarray(scenes["scene/object_pose"], float)
         scene = np.asarray(scenes["grasp/scene_index"])
         row = np.arange(len(scene)) if planned else np.asarray(scenes["grasp/base_index"])
@@ -180,11 +176,8 @@ class Scenes:
         self._scene, self._row = scene[kept], row[kept]
         pose = np.asarray(scenes["grasp/hand_pose"], float)[kept]
         self._pose = transforms.compose(self._object[self._scene], pose) if planned else pose
-        self._columns = {
-            name: np.asarray(base[name])[self._row]
-            for name in ("grasp/joint_positions", *quality)
-            if name in base.arrays
-        }
+        columns = [name for name in ("grasp/joint_positions", *quality) if name in base.arrays]
+        self._columns = {name: np.asarray(base[name])[self._row] for name in columns}
 
     def object_pose(self, scene: int) -> NDArray[np.float64]:
         return self._object[scene]

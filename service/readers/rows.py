@@ -29,7 +29,7 @@ class _Packed:
     dtype: np.dtype[Any]
     shuffled: bool
     places: NDArray[np.int64]
-    """(rows, 2) offset and length in the file [bytes]."""
+    """(rows, 2) offset and length of each row in the file [bytes]."""
 
     def unpack(self, data: bytes) -> Array:
         raw = np.frombuffer(zlib.decompress(data), np.uint8)
@@ -44,7 +44,7 @@ class _Packed:
 
 @dataclass(frozen=True)
 class RowTable:
-    """Columns of a shard: file positions of the rows in packed columns, values of other columns."""
+    """Columns of a shard: file positions of the rows of packed columns, values of other columns."""
 
     name: str
     packed: dict[str, _Packed]
@@ -52,7 +52,7 @@ class RowTable:
 
     @classmethod
     def of(cls, file: h5py.File, columns: Iterable[str], name: str) -> RowTable:
-        """Read the table of an open shard, with checked values of columns that are not packed."""
+        """Read the table of an open shard, and the verified values of columns that are not packed."""
         found = {column: _packed(file[column]) for column in columns}
         packed = {column: places for column, places in found.items() if places is not None}
         held = {column: read_column(file, column, name) for column in found.keys() - packed}
@@ -81,7 +81,7 @@ class RowTable:
 
 
 def _packed(dataset: h5py.Dataset) -> _Packed | None:
-    """Return a column packed as `write_shard` packs pictures; None if its layout differs."""
+    """Return a column in the layout in which `write_shard` packs pictures; None for another layout."""
     if dataset.chunks is None or dataset.chunks != (1, *dataset.shape[1:]):
         return None
     facts = dataset.id.get_create_plist()
@@ -90,9 +90,8 @@ def _packed(dataset: h5py.Dataset) -> _Packed | None:
     if filters not in ([_SHUFFLE, _DEFLATE], [_DEFLATE]) or dataset.id.get_num_chunks() != rows:
         return None
     places = np.zeros((rows, 2), np.int64)
-    rest = (0,) * (dataset.ndim - 1)
     for row in range(rows):
-        found = dataset.id.get_chunk_info_by_coord((row, *rest))
+        found = dataset.id.get_chunk_info_by_coord((row, *(0,) * (dataset.ndim - 1)))
         if found.filter_mask:  # A filter was skipped for this chunk.
             return None
         places[row] = found.byte_offset, found.size

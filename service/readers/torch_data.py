@@ -27,20 +27,17 @@ Sample = dict[str, Any]
 
 
 def tensors(sample: Sample) -> Sample:
-    """Convert the arrays of a sample to tensors: float64 to float32 for networks; strings stay strings."""
+    """Convert the arrays of a sample to tensors, float64 to float32; strings stay strings."""
     return {name: _tensor(value) for name, value in sample.items()}
 
 
 def collate(samples: Sequence[Sample]) -> Sample:
-    """Collate one batch by stacking; grasps of scenes (pictures, clouds) stay a list of tensors."""
-    pictures = "grasp/base_row" in samples[0]
-    batch: Sample = {}
-    for name in samples[0]:
-        values = [sample[name] for sample in samples]
-        # Scenes may have equal numbers of grasps by chance, but the type of the batch must not depend on the numbers.
-        listed = pictures and name.startswith(OF_GRASPS)
-        batch[name] = values if listed else default_collate(values)
-    return batch
+    """Stack samples to a batch; the grasps of pictures and clouds stay lists of tensors."""
+    has_scenes = "grasp/base_row" in samples[0]
+    columns = {name: [sample[name] for sample in samples] for name in samples[0]}
+    # Lists even if all scenes have equal numbers of grasps: the type must not depend on the numbers.
+    is_list = {name: has_scenes and name.startswith(OF_GRASPS) for name in columns}
+    return {name: values if is_list[name] else default_collate(values) for name, values in columns.items()}
 
 
 class Samples(Dataset[Sample]):
@@ -59,7 +56,7 @@ class Samples(Dataset[Sample]):
 class ShuffledShards(IterableDataset[Sample]):
     """Grasps of any number of shards in random order, read shard by shard.
 
-    Each epoch shuffles the shards again and distributes them over the processes of a `DataLoader` and the ranks of a
+    Each `epoch` shuffles the shards and distributes them over the processes of a `DataLoader` and the ranks of a
     distributed run. A buffer mixes grasps of several shards.
     """
 
@@ -89,10 +86,9 @@ class ShuffledShards(IterableDataset[Sample]):
         transform: maps a sample of arrays to the value that the loader collates.
         """
         self.epoch = 0
-        self._shards, self._columns, self._where = shards, tuple(columns), where
-        self._valid, self._unvalidated = valid, unvalidated
+        self._shards, self._columns, self._transform = shards, tuple(columns), transform
+        self._selection: dict[str, Any] = {"valid": valid, "unvalidated": unvalidated, "where": where}
         self._buffer, self._seed, self._rank, self._ranks = max(1, buffer), seed, rank, ranks
-        self._transform = transform
 
     def __iter__(self) -> Iterator[Sample]:
         worker = get_worker_info()
@@ -103,10 +99,8 @@ class ShuffledShards(IterableDataset[Sample]):
         draw = np.random.default_rng([self._seed, self.epoch, share])
         held: list[Sample] = []
         for at in order:
-            one = Shards((files[at],), self._shards.store, self._shards.cache)
-            for sample in Grasps(
-                one, self._columns, valid=self._valid, unvalidated=self._unvalidated, where=self._where
-            ):
+            shard = Shards((files[at],), self._shards.store, self._shards.cache)
+            for sample in Grasps(shard, self._columns, **self._selection):
                 held.append(sample)
                 if len(held) > self._buffer:
                     yield self._transform(_draw(held, draw))

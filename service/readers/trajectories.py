@@ -1,4 +1,4 @@
-"""Trajectory of a grasp from a base shard: postures from the standoff, or the pregrasp, to the lift."""
+"""Trajectories of grasps in base shards: postures from standoff or pregrasp to squeeze or lift."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import Floats, slerp
 from graspd.service.store.shards import Shard
 
-#: Names of the stops, postures at which a phase begins or ends. Waypoints between stops have no name.
+#: Names of postures at which a phase begins or ends. Waypoints between them have no name.
 STOPS: Final = ("standoff", "pregrasp", "grasp", "squeeze", "lift")
 
 
@@ -36,7 +36,7 @@ class Waypoint:
 def trajectory_of(shard: Shard, row: int) -> list[Waypoint]:
     """Return the trajectory of a grasp: pregrasp, grasp, squeeze; approach and lift if present.
 
-    The last waypoint of an approach and the pregrasp have the same hand pose; the open fingers close between them.
+    The last waypoint of the approach and the pregrasp have the same hand pose; the fingers close between them.
     """
     rest = np.zeros(3)
 
@@ -56,13 +56,13 @@ def trajectory_of(shard: Shard, row: int) -> list[Waypoint]:
 
 
 def slider_positions(way: Sequence[Waypoint]) -> Floats:
-    """Return each waypoint's slider position (W,): 0, 1, 2, ... for stops, evenly spaced between them."""
+    """Return the slider position of each waypoint (W,): 0, 1, 2, ... for `STOPS`, evenly spaced between."""
     stops = [k for k, point in enumerate(way) if point.name]
     return np.interp(np.arange(len(way)), stops, np.arange(len(stops)))
 
 
 def point_at(way: Sequence[Waypoint], place: float) -> Waypoint:
-    """Interpolate a posture at a slider position: linear for positions and joints, slerp for rotation."""
+    """Interpolate the posture at a slider position: linear for positions and joints, slerp for rotations."""
     places = slider_positions(way)
     place = float(np.clip(place, places[0], places[-1]))
     k = min(int(np.searchsorted(places, place, side="right")) - 1, len(way) - 2)
@@ -79,18 +79,17 @@ def point_at(way: Sequence[Waypoint], place: float) -> Waypoint:
 
 
 def wrists_of(shard: Shard, rows: NDArray[np.integer[Any]]) -> Floats | None:
-    """Return wrist angles (N, U) above the hand's root for grasps in scenes; None if the shard has none."""
-    if "grasp/wrist_positions" not in shard.arrays:
-        return None
-    return np.asarray(shard["grasp/wrist_positions"], float)[rows]
+    """Return the angles (N, U) of wrist joints above the hand's root [rad]; None if the shard has none."""
+    angles = shard.arrays.get("grasp/wrist_positions")
+    return None if angles is None else np.asarray(angles, float)[rows]
 
 
 def scene_spec_of(shard: Shard) -> SceneSpec | None:
-    """Return the scene of a shard's grasps, poses or pictures; None if not stated. InputError if invalid."""
-    said = shard.attributes.get("scene")
-    if said is None:
+    """Return the scene of a shard's grasps or pictures; None for free objects. InputError if invalid."""
+    text = shard.attributes.get("scene")
+    if text is None:
         return None
     try:
-        return SceneSpec(**from_json(str(said)))
+        return SceneSpec(**from_json(str(text)))
     except (ValueError, TypeError):
         raise InputError("the shard's attribute scene is not a valid scene") from None

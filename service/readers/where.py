@@ -27,7 +27,7 @@ _STATUSES: Final = {
     "feasible": validity.feasible_mask,
     "validated": validity.validated_mask,
 }
-#: Columns of flags; 1 means true.
+#: Columns of flags, which are true where the column is 1.
 _FLAGS: Final = {"held": "quality/success", "lift": "quality/lift_outcome", "lift_hard": "quality/lift_hard"}
 
 
@@ -65,7 +65,7 @@ def _flag(name: str, columns: Mapping[str, Array]) -> Mask:
 
 
 def value_of(metric: GraspMetric, columns: Mapping[str, Array]) -> NDArray[np.float64]:
-    """Return a metric (N,) of the grasps of a base shard; nan if the shard lacks it."""
+    """Return a metric (N,) of the grasps of a base shard; nan if the shard does not have it."""
     if metric.path not in columns:
         return np.full(len(columns["quality/valid"]), np.nan)
     values = np.asarray(columns[metric.path], float)

@@ -1,8 +1,7 @@
 """Addresses of a running service: its URL, and access for workers on other machines.
 
-The record of the URL names the process that wrote it. After a crash of that process the record is ignored, and
-replaced at the next start. The file for other machines is private to its user and meant for a shared folder of a
-cluster. Every start writes it atomically, and the end of the service removes it.
+The record of the URL names its writer, and is ignored after a crash of that process. The file for other machines is
+private to its user and meant for a shared folder of a cluster. The end of the service removes the file.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _FILE: Final = "api.json"
 
 
 def record_address(folder: Path, url: str) -> None:
-    """Record that this process's service has the address `url`."""
+    """Record `url` as the address of the service of this process."""
     record = {"api_url": url, "pid": os.getpid(), "started": start_time(os.getpid())}
     write_atomically(folder / _FILE, [json.dumps(record).encode()])
 
@@ -39,12 +38,12 @@ def local_url(host: str, port: int) -> str:
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Bind a socket to the port (0: a free one). BusyError: port in use. InputError: unusable address.
+    """Bind a socket to a port (0: a free port). BusyError: port in use. InputError: unusable address.
 
-    While it is open, the API of a child process can listen there, and no other process gets the port.
+    While the socket is open, the API of a child process can listen on the port, and no other process gets the port.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio disables Nagle's algorithm only on sockets with an explicit protocol; otherwise each body is 40 ms late.
+    # asyncio disables Nagle's algorithm, which delays bodies by 40 ms, only on sockets with an explicit protocol.
     bound = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -52,9 +51,8 @@ def bind(host: str, port: int) -> socket.socket:
     except OSError as error:
         bound.close()
         if error.errno == errno.EADDRINUSE:
-            raise BusyError(
-                f"port {port} on {host} is in use; stop its process, or choose another with --port or GRASPD_PORT"
-            ) from None
+            fix = "stop its process, or choose another port with --port or GRASPD_PORT"
+            raise BusyError(f"port {port} on {host} is in use; {fix}") from None
         raise InputError(f"the address {host}:{port} cannot be used: {error.strerror or error}") from None
     return bound
 
@@ -67,7 +65,7 @@ def forget_address(folder: Path) -> None:
 
 
 def recorded_address(folder: Path) -> str | None:
-    """Return the URL of a data folder's service; None if not recorded, or the recording process is gone."""
+    """Return the recorded URL of a data folder's service; None without a record of a living process."""
     record = _read(folder)
     return record[0] if record is not None and start_time(record[1]) == record[2] else None
 
@@ -75,7 +73,7 @@ def recorded_address(folder: Path) -> str | None:
 def _read(folder: Path) -> tuple[str, int, str] | None:
     try:
         file = folder / _FILE
-        # A file of another user could send this user's key to a foreign server.
+        # The file of another user could direct this user's key to a foreign server.
         if file.stat().st_uid not in (os.getuid(), 0):
             return None
         record = json.loads(file.read_text())
@@ -93,7 +91,7 @@ class ListenAddress:
     file: Path
     host: str
     address: str
-    """Address of this machine to which the name resolves: Redis listens only there."""
+    """Address to which the name of this machine resolves; Redis listens only on this address."""
     port: int
     password: str = field(repr=False)
 
@@ -102,13 +100,9 @@ class ListenAddress:
         return f"redis://:{self.password}@{self.host}:{self.port}/0"
 
     def write(self, settings: Settings, api_url: str) -> None:
-        """Write the settings for workers, as lines for a shell and `--env-file`; UnavailableError on failure."""
-        said = {
-            "GRASPD_REDIS_URL": self.redis_url,
-            "GRASPD_STORE_URL": settings.resolved_store_url,
-            "GRASPD_API_URL": api_url,
-        }
-        text = "".join(f"{name}={shlex.quote(value)}\n" for name, value in said.items())
+        """Write the settings of workers as lines for a shell or `--env-file`; UnavailableError on failure."""
+        urls = {"REDIS": self.redis_url, "STORE": settings.resolved_store_url, "API": api_url}
+        text = "".join(f"GRASPD_{name}_URL={shlex.quote(value)}\n" for name, value in urls.items())
         try:
             write_atomically(self.file, [text.encode()])
         except OSError as error:
@@ -122,9 +116,9 @@ class ListenAddress:
 
 
 def new_listen_address(settings: Settings, file: Path, *, host: str | None = None, port: int = 0) -> ListenAddress:
-    """Return an address of this machine, a free port (or `port`) and a new password.
+    """Return an address of this machine with port `port` (0: a free port) and a new password.
 
-    InputError: other machines cannot share the configured Redis or store through this file.
+    InputError: the settings name a Redis, which needs no file, or no store that other machines can reach.
     """
     if settings.redis_url is not None:
         raise InputError("GRASPD_REDIS_URL is already set: give it to the workers, and omit --share")

@@ -1,4 +1,4 @@
-"""Child process of a supervisor: start, watch, restart with back-off, stop."""
+"""Child processes of a supervisor: start, restart with back-off, stop."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from pathlib import Path
 from typing import IO, Final
 
 log = logging.getLogger(__name__)
-#: Environment variable by which a later `graspd up` identifies a child.
+#: Environment variable of a child, by which a later `graspd up` identifies the process.
 _TOKEN: Final = "GRASPD_CHILD_TOKEN"
 _WATCH_S: Final = 0.1
 _FIRST_PAUSE_S: Final = 0.2
 _LONGEST_PAUSE_S: Final = 10.0
-#: Uptime [s] after which a child counts as healthy; its next restart follows the shortest pause.
+#: Uptime after which a child counts as healthy, and its next restart follows the shortest pause [s].
 _WELL_AFTER_S: Final = 20.0
 
 
 @dataclass
 class Child:
-    """Named process. All calls come from one thread, because the kernel ties the child to it."""
+    """Child process. One thread makes all calls, because the kernel kills children of an ended thread."""
 
     name: str
     command: Sequence[str]
     environment: Mapping[str, str]
     folder: Path | None
-    """Data folder: pid files go to `run/`, output to `logs/`. None: no such files; the parent's output is used."""
+    """Data folder, with pid files in `run/` and output in `logs/`; None: no files, output of the parent."""
     fix: Callable[[Path], None] | None = None
-    """Called with the log after a failure, before the restart."""
+    """Function that is called with the path of the log before the restart after a failure."""
     process: subprocess.Popen[bytes] | None = None
     starts: int = 0
     _started: float = 0.0
@@ -47,14 +47,14 @@ class Child:
 
     @property
     def pid_file(self) -> Path | None:
-        return self.folder / "run" / f"{self.name}.pid" if self.folder is not None else None
+        return self.folder and self.folder / "run" / f"{self.name}.pid"
 
     @property
     def _log_file(self) -> Path | None:
-        return self.folder / "logs" / f"{self.name}.log" if self.folder is not None else None
+        return self.folder and self.folder / "logs" / f"{self.name}.log"
 
     def start(self) -> None:
-        """Start the process in its own session: Ctrl-C in the terminal reaches only the parent."""
+        """Start the process in its own session, so that Ctrl-C in the terminal reaches only the parent."""
         token = secrets.token_hex(16)
         with self._output() as output:
             self.process = subprocess.Popen(
@@ -72,7 +72,7 @@ class Child:
         self._started = time.monotonic()
 
     def watch(self) -> None:
-        """Restart the process if it ended, with a longer pause after each consecutive failure."""
+        """Restart the process if it has ended, after a pause that doubles with each further failure."""
         now = time.monotonic()
         if self.process is not None:
             code = self.process.poll()
@@ -80,7 +80,7 @@ class Child:
                 return
             if code == 0 or now - self._started > _WELL_AFTER_S:
                 self._pause = _FIRST_PAUSE_S
-            # A worker ends by itself with code 0 after enough work.
+            # A worker ends with code 0 when it is to be replaced.
             level = logging.WARNING if code else logging.INFO
             log.log(level, "%s ended (%s); it is started again in %.2g s", self.name, _exit_text(code), self._pause)
             if code > 0 and self.fix is not None and self._log_file is not None:
@@ -123,7 +123,7 @@ def keep_alive(children: Sequence[Child], stop: threading.Event) -> None:
 
 
 def stop_children(children: Sequence[Child], grace_s: float) -> None:
-    """Stop all children at once; kill those that still run after the grace time [s]."""
+    """Ask all children to stop; kill those that still run after the grace time [s]."""
     for child in children:
         child.ask_to_stop()
     deadline = time.monotonic() + grace_s
@@ -132,16 +132,14 @@ def stop_children(children: Sequence[Child], grace_s: float) -> None:
 
 
 def kill_leftovers(folder: Path) -> list[int]:
-    """Kill children named in pid files of an earlier `graspd up`, except reused pids; return the pids."""
+    """Kill children of an earlier `graspd up` by their pid files, except reused pids; return the pids."""
     ended = []
     for file in (folder / "run").glob("*.pid"):
-        try:
+        with contextlib.suppress(ValueError, TypeError, OSError, OverflowError):
             pid, started, token = json.loads(file.read_text())
             if pid not in (os.getpid(), os.getppid()) and start_time(pid) == started and _has_token(pid, token):
                 os.kill(pid, signal.SIGKILL)
                 ended.append(pid)
-        except (ValueError, TypeError, OSError, OverflowError):
-            pass
         file.unlink(missing_ok=True)
     return ended
 
@@ -165,11 +163,11 @@ _STARTED: Final = 19
 
 
 def start_time(pid: int) -> str:
-    """Return the start time of a process, unique per pid; "" if there is no such process."""
+    """Return the start time of a process with the id of the boot; "" if there is no such process."""
     with contextlib.suppress(OSError, IndexError):
         words = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
         return f"{words[_STARTED]} {_BOOT.read_text().strip()}"
     if _BOOT.exists():
         return ""
-    said = subprocess.run(["ps", "-o", "lstart=", "-p", str(pid)], capture_output=True, text=True, check=False)
-    return " ".join(said.stdout.split())
+    listing = subprocess.run(["ps", "-o", "lstart=", "-p", str(pid)], capture_output=True, text=True, check=False)
+    return " ".join(listing.stdout.split())

@@ -1,4 +1,4 @@
-"""Commands of the service: up, controller, index."""
+"""Commands `graspd up`, `graspd controller` and `graspd admin index`."""
 
 from __future__ import annotations
 
@@ -40,17 +40,13 @@ app.add_typer(index_app, name="index")
 def up(
     workers: Annotated[int, typer.Option(min=0, help="Worker processes on this machine.")] = 1,
     host: Annotated[str | None, typer.Option(help="Address of the API; GRASPD_HOST.")] = None,
-    port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="Port of the API; 0: any free port; GRASPD_PORT.")
-    ] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port of the API; 0: any; GRASPD_PORT.")] = None,
     device: Annotated[str | None, typer.Option(help="Device of the workers: cpu, cuda:0, auto; GRASPD_DEVICE.")] = None,
     share: Annotated[
-        Path | None,
-        typer.Option(help="Share the queue with other machines; write the settings of their workers to this file."),
+        Path | None, typer.Option(help="Share the queue; write the settings of workers on other machines to this file.")
     ] = None,
     share_host: Annotated[
-        str | None,
-        typer.Option(help="With --share: address of this machine for other machines; default: its host name."),
+        str | None, typer.Option(help="With --share: address of this machine; default: its host name.")
     ] = None,
     redis_port: Annotated[
         int, typer.Option(min=0, max=65535, help="With --share: port of Redis for other machines; 0: any free port.")
@@ -86,12 +82,10 @@ def up(
 
 @app.command(epilog="graspd controller")
 def controller(
-    check: Annotated[
-        bool, typer.Option("--check", help="Only check for a live controller; exit code 1 if there is none.")
-    ] = False,
+    check: Annotated[bool, typer.Option("--check", help="Only check for a controller; exit code 1: none.")] = False,
     data_dir: DataDir = None,
 ) -> None:
-    """Run a controller (retries, index); one leads, others stand by. `graspd up` starts one."""
+    """Run a controller (retries, index), which leads or stands by. `graspd up` starts one."""
     settings = load_settings(data_dir=data_dir)
     log_to_stderr(settings, "controller")
     restrict_file_access(settings)
@@ -101,7 +95,7 @@ def controller(
 
         with closing(open_queue(settings, patience=0)) as queue:
             if not queue.is_announced(PART):
-                raise UnavailableError("no controller sent a heartbeat lately; start `graspd controller`")
+                raise UnavailableError("no controller sent a heartbeat recently; start `graspd controller`")
         return
     _run_controller(settings, stop_on_signals())
 
@@ -116,10 +110,10 @@ def _run_controller(settings: Settings, stop: threading.Event) -> None:
     alive = HeartbeatFile(settings.heartbeat_file)
     with closing(open_queue(settings, patience=0)) as queue:
         leadership = Leadership(queue, lease_s=settings.lease_s, alive=alive, name=settings.controller_name)
-        # A controller of another service must not stand by here: processes would mistake it for their own.
+        # A controller of another service must not stand by here, because it could lead this service later.
         _identify(settings, stop, alive)
         while leadership.wait(stop):
-            # A new controller receives again the events that an earlier one did not finish.
+            # A new controller again receives unfinished events of its predecessor.
             with leadership.hold(stop) as over, closing(Services.open(settings)) as services:
                 Controller(services).run(over)
 
@@ -146,9 +140,7 @@ def rebuild(
     data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
-    """Rebuild the index from the store, and make this service the owner of the store.
-
-    An index of another graspd version is replaced by one with the tables of this version.
+    """Rebuild the index from the store with this version's tables; this service then owns the store.
 
     With --check, exit code 1 means: index and store differ, or a shard is damaged.
     """
@@ -185,7 +177,7 @@ def rebuild(
     else:
         for line in found:
             typer.echo(line)
-        typer.echo("the index matches the store" if not found else f"{len(found)} differences", err=True)
+        typer.echo(f"{len(found)} differences" if found else "the index matches the store", err=True)
     services.close()
     if check and found:
         raise typer.Exit(1)

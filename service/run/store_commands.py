@@ -1,4 +1,4 @@
-"""`graspd admin store`: checks and conversion of the store."""
+"""Commands `graspd admin store`: check, repair and conversion of the store."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ app = CommandGroup(no_args_is_help=True)
 store_app = CommandGroup(no_args_is_help=True, help="Verify and repair the store.")
 app.add_typer(store_app, name="store")
 
-#: Time [s] for which the controller's integrity scan pauses after each renewal.
+#: Pause of the controller's integrity scan after each renewal [s].
 _PAUSE_S: Final = 15.0
 
 
@@ -29,7 +29,7 @@ def verify(
 ) -> None:
     """Verify all objects of the store and report damaged or missing ones; exit code 1 if any remain.
 
-    The controller's integrity scan pauses meanwhile; a concurrent call is refused.
+    The controller's integrity scan pauses meanwhile; a concurrent call fails.
     """
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.identity import identify_if_redis_answers

@@ -41,7 +41,7 @@ _PROGRAM: Final = (sys.executable, "-m", "graspd")
 
 
 class Supervisor:
-    """Context manager that starts the service on this machine, restarts failed parts and stops it cleanly."""
+    """Context manager of the service on this machine, which starts, restarts and stops its processes."""
 
     def __init__(
         self,
@@ -53,11 +53,8 @@ class Supervisor:
         joining: ListenAddress | None = None,
     ) -> None:
         """`settings.port` 0 selects a free port; `joining` admits workers of other machines."""
-        self._wanted = settings
-        self._workers = workers
-        self._api = api
-        self._worker_command = tuple(worker_command)
-        self._joining = joining
+        self._wanted, self._workers, self._api = settings, workers, api
+        self._worker_command, self._joining = tuple(worker_command), joining
         self._locks: list[IO[str] | socket.socket] = []
         self._children: list[Child] = []
         self._thread: threading.Thread | None = None
@@ -81,9 +78,9 @@ class Supervisor:
         return {child.name: child.process.pid for child in list(self._children) if child.process is not None}
 
     def start(self) -> None:
-        """Lock the data folder and start the children without waiting for readiness.
+        """Lock the data folder and start the children; do not wait until they are ready.
 
-        BusyError: another graspd owns the data folder (the message has its pid), or the port is taken.
+        BusyError: another graspd owns the data folder (with its pid), or the port is in use.
         """
         self._stopping.clear()
         folder = self._wanted.data_dir.resolve()
@@ -102,7 +99,7 @@ class Supervisor:
         except GraspdError:
             self._release()
             raise
-        # The kernel kills a child when the thread that started it ends, so one long-lived thread starts them all.
+        # The kernel kills a child when the thread that started the child ends, so one thread starts all children.
         self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
         self._thread.start()
 
@@ -115,8 +112,8 @@ class Supervisor:
     ) -> bool:
         """Wait until Redis, controller, workers and the API answer; return False if `stop` is set first.
 
-        Raises UnavailableError, with the absent parts and the logs, after `timeout` [s], and earlier if a process ends
-        repeatedly or an external Redis is silent. `say` receives the missing parts every 15 s.
+        Raises UnavailableError, with the missing parts, after `timeout` [s], or earlier if a process ends repeatedly or
+        an external Redis does not answer. Every 15 s, `say` is called with the missing parts.
         """
         began = told = time.monotonic()
         starts, logs = self._starts(), self.settings.data_dir / "logs"
@@ -124,12 +121,11 @@ class Supervisor:
             while missing := self._missing_parts(queue):
                 if stop is not None and stop.is_set():
                     return False
-                if "redis" in missing:  # Other processes may have ended because Redis is missing.
+                if "redis" in missing:  # Without Redis, other processes end and are not to blame.
                     starts = {**self._starts(), "redis": starts.get("redis", 0)}
                 now = time.monotonic()
                 patience = min(timeout, _REDIS_S) if "redis" in missing and self._wanted.redis_url else timeout
-                again = [name for name, count in self._starts().items() if count - starts.get(name, 0) >= _ENDS]
-                if again:
+                if again := [name for name, count in self._starts().items() if count - starts.get(name, 0) >= _ENDS]:
                     raise UnavailableError(f"{', '.join(again)} ended {_ENDS} times before getting ready; see {logs}")
                 if now - began > patience or self._stopping.is_set():
                     raise UnavailableError(f"not ready after {now - began:.0f} s: {', '.join(missing)}; see {logs}")
@@ -159,7 +155,7 @@ class Supervisor:
             if sum(beat.state != "quarantined" for beat in beats) < self._workers:
                 missing.append("; ".join(["workers", *sorted({beat.reason for beat in beats if beat.reason})]))
         except UnavailableError:
-            missing += ["redis"]
+            missing.append("redis")
         if self._api and not missing and not self._api_is_ready():
             missing.append("api")
         return missing
@@ -216,20 +212,14 @@ class Supervisor:
             redis = child("redis", *server_command(self.settings, self._joining))
             redis.fix = lambda output: move_broken_log(self.settings, output)
             children.append(redis)
-        # A restarted controller need not wait for the end of its predecessor's lease.
+        # With an equal name, a restarted controller does not wait for the end of its earlier lease.
         name = self._wanted.controller_name or f"{socket.gethostname()}-up-{secrets.token_hex(8)}"
         children.append(child("controller", *_PROGRAM, "controller", GRASPD_CONTROLLER_NAME=name))
         if self._api:
             children.append(child("api", *_PROGRAM, "api"))
-        children += [
-            child(
-                f"worker-{number}",
-                *self._worker_command,
-                GRASPD_WORKER_NUMBER=str(number),
-                GRASPD_WORKERS_HERE=str(self._workers),
-            )
-            for number in range(self._workers)
-        ]
+        for number in range(self._workers):
+            place = {"GRASPD_WORKER_NUMBER": str(number), "GRASPD_WORKERS_HERE": str(self._workers)}
+            children.append(child(f"worker-{number}", *self._worker_command, **place))
         return children
 
     def _run(self) -> None:
@@ -238,18 +228,17 @@ class Supervisor:
         except Exception:
             log.exception("the supervisor stops because of an error")
         finally:
-            # Workers return their tasks while Redis and controller still accept them.
-            for some in ("worker", ("api", "controller"), "redis"):
-                named = [child for child in self._children if child.name.startswith(some)]
-                stop_children(named, self.settings.stop_grace_s)
+            # Workers stop first, so that Redis and controller still accept their unfinished tasks.
+            for names in ("worker", ("api", "controller"), "redis"):
+                group = [child for child in self._children if child.name.startswith(names)]
+                stop_children(group, self.settings.stop_grace_s)
 
     def _record(self, folder: Path) -> None:
         if self._joining is not None:
             self._joining.write(self.settings, self.api_url)
-        if not self._api:
-            return
         try:
-            record_address(folder, self.api_url)
+            if self._api:
+                record_address(folder, self.api_url)
         except OSError as error:
             log.warning("the address of the API cannot be written to %s: %s", folder, error.strerror)
 
@@ -273,9 +262,7 @@ def _explicit_settings(settings: Settings) -> dict[str, str]:
 
 
 def _as_variable(value: object) -> str:
-    """Format a setting for the environment; an empty variable counts as unset."""
-    if value is None:
-        return ""
+    """Format a setting for the environment; "" means unset."""
     if isinstance(value, SecretStr):
         return value.get_secret_value()
-    return json.dumps(value) if isinstance(value, dict) else str(value)
+    return "" if value is None else json.dumps(value) if isinstance(value, dict) else str(value)

@@ -1,4 +1,4 @@
-"""Command-line options of a hand or an object, stored as keys of its `asset.json`."""
+"""Command-line options of a hand or an object, and their values as keys of its `asset.json`."""
 
 from __future__ import annotations
 
@@ -27,11 +27,9 @@ class HandWords(Model):
         None, description="approach direction out of the palm, in the palm's frame: x,y,z"
     )
     root: Annotated[str | None, _TYPED] = Field(
-        None, description="root link; links above it, such as forearm and wrist, are omitted"
+        None, description="root link; links above it, such as the wrist, are omitted"
     )
-    pre_shape: Annotated[tuple[str, ...], _TYPED] = Field(
-        (), description="joint values on approach (rad, m): JOINT=VALUE,..."
-    )
+    pre_shape: Annotated[tuple[str, ...], _TYPED] = Field((), description="joint values on approach: JOINT=VALUE,...")
     closing: Annotated[tuple[str, ...], _TYPED] = Field(
         (), description="closing direction of joints, -1, 0 (spreads) or 1: JOINT=-1,..."
     )
@@ -57,7 +55,7 @@ def provenance(licence: str | None, source: str | None) -> dict[str, Any]:
 
 
 def hand_options(**given: Any) -> dict[str, Any]:
-    """Return the keys of a hand's `asset.json` for options of `HandWords`, without absent options."""
+    """Convert options of `HandWords` to keys of a hand's `asset.json`; omit absent options."""
     words = HandWords(**given)
     options: dict[str, Any] = {
         "file": words.urdf,
@@ -75,6 +73,7 @@ def hand_options(**given: Any) -> dict[str, Any]:
 
 
 def sizes_of(text: str | None) -> tuple[float, ...]:
+    """Parse the distinct sizes of `--scale-to` [m]."""
     try:
         sizes = tuple(dict.fromkeys(float(part) for part in text.split(","))) if text else ()
     except ValueError:

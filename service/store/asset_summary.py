@@ -1,4 +1,4 @@
-"""Summary of an asset's check: sizes and guesses. The check's messages list the repairs."""
+"""Text of the check of an asset: verdict, sizes and guessed values."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 
 from graspd.service.model.states import AssetKind
 
-#: Displacements of the surface below this [m] are rounding errors, and are not reported.
+#: Displacements of the surface up to this value [m] are rounding errors, and are not reported.
 _NOTHING_M = 1e-7
 _OVERRIDES = {"palm": "--palm LINK --approach x,y,z", "preshape": "--pre-shape JOINT=VALUE,..."}
 
@@ -34,20 +34,22 @@ def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
 
 
 def self_test_line(facts: Mapping[str, Any]) -> str:
-    """Return the self-test's result, `ready: 91 % hold, ...` or a warning; empty without self-test."""
-    tried = facts.get("self_test")
-    return str(tried.get("says", "")) if isinstance(tried, Mapping) else ""
+    """Return the result of the self-test, `ready: 91 % hold, ...` or a warning; "" without self-test."""
+    return str(_mapping(facts, "self_test").get("says", ""))
 
 
 def limit_line(facts: Mapping[str, Any]) -> str:
-    tried = facts.get("self_test")
-    limit = tried.get("limit") if isinstance(tried, Mapping) else None
-    return str(limit.get("says", "")) if isinstance(limit, Mapping) else ""
+    return str(_mapping(_mapping(facts, "self_test"), "limit").get("says", ""))
+
+
+def _mapping(facts: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    return found if isinstance(found := facts.get(key), Mapping) else {}
 
 
 def self_test_lines(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return labels and texts of the self-test: its result, and the payload of the hand."""
     lines = [("self-test", self_test_line(facts)), ("payload", limit_line(facts))]
-    return [(label, says) for label, says in lines if says]
+    return [(label, text) for label, text in lines if text]
 
 
 def hand_line(facts: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Hands and objects: reproducible ZIPs (sorted names, fixed times) in the store, built-ins on disk."""
+"""Files of hands and objects: reproducible ZIPs (sorted names, fixed times), and built-in files."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ from graspd.service.model.states import AssetKind
 from graspd.service.store.descriptions import MAX_BYTES, parse_description
 
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
-#: Creation date of built-in assets: that of the release, so that repeated publication writes the same record.
+#: Creation date of built-in assets: the date of the release, so that repeated publication writes equal records.
 _BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
 MAX_FILES: Final = 2000
-#: zlib's message for lack of memory, to distinguish it from damage.
+#: Prefix of zlib's message about lack of memory; other messages mean damage.
 _NO_MEMORY: Final = "Error -4 "
-#: Limits on one file name and on all together [characters]: every list of hands or objects contains them.
+#: Limits on one file name and on all names together [characters]; every list of hands or objects contains them.
 MAX_NAME: Final = 255
 MAX_NAMES: Final = 128 << 10
-#: Limit on the ratio of unpacked to packed size: robot meshes have about 4, so only ZIP bombs exceed it.
+#: Limit on the ratio of unpacked to packed size, exceeded only by ZIP bombs; robot meshes have about 4.
 UNPACK_FACTOR: Final = 8
 _PIECE_BYTES: Final = 1 << 16
 _T = TypeVar("_T")
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
+    """Return a ZIP of files; equal files give equal bytes."""
     buffer = io.BytesIO()
     pack_into(files, buffer)
     return buffer.getvalue()
@@ -67,7 +68,7 @@ def unpack_file(path: Path) -> dict[str, bytes]:
 
 
 def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
-    """Remove the folder's name from all names if all files are in one folder."""
+    """Remove the first folder from all names, if all files are in that folder."""
     tops = {name.partition("/")[0] for name in files}
     if len(tops) == 1 and all("/" in name for name in files):
         return {name.partition("/")[2]: entry for name, entry in files.items()}
@@ -75,7 +76,7 @@ def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
 
 
 class ZipFiles(MutableMapping[str, bytes]):
-    """Files of a ZIP on disk, unpacked in pieces on demand, and added files. Digests are of contents."""
+    """Files of a ZIP on disk, unpacked in pieces on demand, and added files; with digests of the contents."""
 
     def __init__(self, file: IO[bytes], *, limit_bytes: int) -> None:
         self._archive = _open_zip(file)
@@ -84,11 +85,10 @@ class ZipFiles(MutableMapping[str, bytes]):
         self._known: dict[str, tuple[int, str]] = {}
         left = limit_bytes
         for name, entry in self._found.items():
-            size, digest = _measure_entry(self._archive, entry, left + 1)
-            left -= size
+            self._known[name] = _measure_entry(self._archive, entry, left + 1)
+            left -= self._known[name][0]
             if left < 0:
                 raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
-            self._known[name] = (size, digest)
 
     def without_common_folder(self) -> Self:
         self._found = without_common_folder(self._found)
@@ -145,7 +145,7 @@ def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
         if entry.flag_bits & 1:
             raise InputError(f"the archive entry {name!r} is encrypted; pack it without a password")
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            # Other compression methods can request gigabytes of memory before the first byte.
+            # Other compression methods can allocate gigabytes of memory before the first byte.
             raise InputError(f"the archive entry {name!r} is compressed in an unusual way; use plain deflate")
         found[name] = entry
     if sum(map(len, found)) > MAX_NAMES:
@@ -190,8 +190,7 @@ def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
     """Load a built-in hand or object: `asset.json` with URDF or mesh; NotFoundError if there is none."""
     folder = _builtin_folder(kind) / name
     if not (folder / "asset.json").is_file():
-        known = ", ".join(builtin_names(kind))
-        raise NotFoundError(f"there is no built-in {kind.value} {name!r}; there are: {known}")
+        raise NotFoundError(f"there is no built-in {kind.value} {name!r}; there are: {', '.join(builtin_names(kind))}")
     files = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
@@ -209,20 +208,19 @@ def create_asset(
     kind: AssetKind, name: str, files: Mapping[str, bytes], *, created: str, builtin: bool = False
 ) -> Asset:
     """Create the asset record of files; the key `file` of their `asset.json` names the main file."""
-    described = parse_description(asset_json(files), f"{kind.value} {name!r}")
-    main = described.file
-    if main not in files:
-        raise InputError(f"{kind.value} {name!r}: the main file {main!r} is not among its files")
+    description = parse_description(asset_json(files), f"{kind.value} {name!r}")
+    if description.file not in files:
+        raise InputError(f"{kind.value} {name!r}: the main file {description.file!r} is not among its files")
     return Asset(
         kind=kind,
         name=name,
         digest=digest_files(kind, files),
-        filename=main,
+        filename=description.file,
         files=tuple(sorted(files)),
         size_bytes=sum(files.size(name) if isinstance(files, ZipFiles) else len(files[name]) for name in files),
         created=created,
         builtin=builtin,
-        facts=described.facts,
+        facts=description.facts,
     )
 
 

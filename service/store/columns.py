@@ -1,4 +1,4 @@
-"""HDF5 schema of shards: shape, unit and meaning of datasets, type and meaning of root attributes."""
+"""HDF5 schema of shards: shape, unit and meaning of datasets; type and meaning of root attributes."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from graspd.service.model.errors import InputError
-from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS
+from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspMetric
 
 ShardKind = Literal["base", "scene", "views"]
-#: Version of each kind's columns. base@1 (graspd 0.2) has other names: `service.model.renamed`.
+#: Version of the columns of each kind. base@1 of graspd 0.2 has other names (`service.model.renamed`).
 _VERSIONS: Final[dict[str, int]] = {"base": 2, "scene": 1, "views": 1}
 
 
@@ -20,7 +20,7 @@ def schema_of(kind: str) -> str:
 
 @dataclass(frozen=True)
 class Column:
-    """One dataset of a shard. Equal letters in `shape` mean equal lengths throughout the shard."""
+    """Dataset of a shard. Equal letters in `shape` mean equal lengths in the whole shard."""
 
     shape: str
     dtype: str
@@ -32,6 +32,10 @@ class Column:
 
 _REST = "share of drops that come to rest on the same face of the convex hull"
 _POSE = "position x y z [m] and unit quaternion w x y z of the hand's root link"
+_NEIGHBOURS = "poses of the neighbours in each scene; names in attribute neighbours"
+_HEIGHT = "height of the lowest point of hand and forearm above the table"
+_BOUNDS = "x_min y_min x_max y_max of the"
+_REJECTIONS = "insufficient clearance: 0 none, 1 table at contact, 2 on approach, 3 neighbour at contact, 4 on approach"
 
 
 def _posture(prefix: str, what: str) -> dict[str, Column]:
@@ -66,25 +70,16 @@ LIFT_OUTCOMES: Final = dict(enumerate((*_LIFT_OUTCOMES, "rotated", "diverged", "
 
 
 def _wrist(rows: str) -> Column:
-    description = (
-        "angles of wrist joints above the hand's root at which all links above the root are clear, order in attribute"
-    )
-    return _optional_column(f"{rows} U", "f8", "rad", "joint", f"{description} wrist_joint_names")
+    description = "collision-free angles of wrist joints above the hand's root, order in attribute wrist_joint_names"
+    return _optional_column(f"{rows} U", "f8", "rad", "joint", description)
 
 
 def _measured(*, optional: bool) -> dict[str, Column]:
-    return {
-        metric.path: Column(
-            "N T" if metric.swept else "N",
-            "i4" if metric.whole else "f8",
-            metric.units,
-            "none",
-            metric.meaning,
-            optional,
-        )
-        for metric in GRASP_METRICS
-        if metric.optional == optional
-    }
+    def column(metric: GraspMetric) -> Column:
+        shape, dtype = "N T" if metric.swept else "N", "i4" if metric.whole else "f8"
+        return Column(shape, dtype, metric.units, "none", metric.meaning, optional)
+
+    return {metric.path: column(metric) for metric in GRASP_METRICS if metric.optional == optional}
 
 
 SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
@@ -94,58 +89,36 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         **_posture("squeeze", "commanded posture that presses on the object"),
         "quality/thresholds_m": Column("T", "f8", "m", "none", "contact thresholds of the sweep"),
         **_measured(optional=False),
-        "quality/valid": Column(
-            "N", "u1", "bool", "none", "1: feasible, and held in validation; 0 also if not validated"
-        ),
+        "quality/valid": Column("N", "u1", "bool", "none", "1: feasible, and held in validation; 0: other"),
         "quality/feasible": _flag("1: within the geometric limits of penetration and contact", "u1"),
-        "quality/success": _flag(
-            "verdict of the validator at the level of attribute verdict_level: 1 held, 0 dropped, -1 not tested"
-        ),
+        "quality/success": _flag("verdict at the level of attribute verdict_level: 1 held, 0 dropped, -1 not tested"),
         "quality/verdict_outcome": _code("outcome per push +x -x +y -y +z -z: ", "N D", outcomes=PUSH_OUTCOMES),
         "quality/verdict_margin": _optional_column(
-            "N",
-            "f8",
-            "1",
-            "none",
-            "largest ratio of displacement or rotation to its limit under the pushes; below 1: held",
+            "N", "f8", "1", "none", "largest ratio of motion to its limit under the pushes; below 1: held"
         ),
-        "quality/validated_by": _code(
-            "engine of the verdict `success`: 0 MuJoCo on the CPU (the reference), 1 MuJoCo Warp (the prefilter)"
-        ),
-        "quality/recheck": _flag(
-            "verdict under the unmodified DexGraspBench protocol: 1 held, 0 dropped, -1 not rechecked"
-        ),
+        "quality/validated_by": _code("engine of `success`: 0 MuJoCo on the CPU, 1 MuJoCo Warp (the prefilter)"),
+        "quality/recheck": _flag("verdict of unmodified DexGraspBench: 1 held, 0 dropped, -1 not rechecked"),
         "quality/published": _flag("published verdict of imported grasps: 1 held, 0 dropped, -1 none"),
         **_measured(optional=True),
         "quality/robust_weakest": _code(
             "perturbed parameter of the first model in which the grasp does not hold: 0 none, ", outcomes=AXIS_MEANINGS
         ),
         # Grasps planned in scenes also have the scene, the approach and the lift.
-        "scene/object_pose": _optional_column(
-            "S 7", "f8", "m, 1", "scene", "object frame at rest in each scene; z is up"
-        ),
+        "scene/object_pose": _optional_column("S 7", "f8", "m, 1", "scene", "object frame at rest; z points up"),
         "scene/rest_probability": _optional_column("S", "f8", "1", "none", _REST),
-        "scene/neighbour_pose": _optional_column(
-            "S M 7", "f8", "m, 1", "scene", "poses of the neighbours in each scene; names in attribute neighbours"
-        ),
+        "scene/neighbour_pose": _optional_column("S M 7", "f8", "m, 1", "scene", _NEIGHBOURS),
         "grasp/scene_index": _optional_column("N", "i4", "1", "none", "row of the grasp's scene in /scene"),
         "grasp/approach": _optional_column(
-            "N W 7",
-            "f8",
-            "m, 1",
-            "object",
-            f"approach waypoints from standoff to pregrasp, joints in approach_joint_positions: {_POSE}",
+            "N W 7", "f8", "m, 1", "object", f"approach waypoints from standoff to pregrasp: {_POSE}"
         ),
         "grasp/approach_joint_positions": _optional_column(
-            "N J", "f8", "rad or m", "joint", "joints of the open hand on approach, order in joint_names"
+            "N J", "f8", "rad or m", "joint", "joints of the open hand, order in joint_names"
         ),
         "grasp/lift": _optional_column("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}"),
         "grasp/wrist_positions": _wrist("N"),
         "quality/lift_outcome": _code("lift test: ", outcomes=LIFT_OUTCOMES),
         "quality/lift_hard": _flag("lift test at half the friction: 1 lifted, 0 not, -1 not tested"),
-        "quality/pushes": _flag(
-            "six pushes without the scene, only in files of graspd 0.2: 1 held, 0 dropped, -1 not tested"
-        ),
+        "quality/pushes": _flag("pushes without the scene, in files of graspd 0.2: 1 held, 0 dropped, -1 not tested"),
     },
     "scene": {
         "scene/object_pose": Column("S 7", "f8", "m, 1", "table", "object frame at rest; table top is z = 0"),
@@ -154,33 +127,15 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "grasp/base_index": Column("K", "i4", "1", "none", "row of the grasp in the base shard"),
         "grasp/scene_index": Column("K", "i4", "1", "none", "row of the scene in /scene"),
         "grasp/hand_pose": Column("K 7", "f8", "m, 1", "table", f"posture at contact: {_POSE}"),
-        "grasp/table_clearance_m": Column(
-            "K",
-            "f8",
-            "m",
-            "table",
-            "height of the lowest point of hand and forearm above the table, from pregrasp to grasp",
-        ),
+        "grasp/table_clearance_m": Column("K", "f8", "m", "table", f"{_HEIGHT}, from pregrasp to grasp"),
         "grasp/valid": Column("K", "u1", "bool", "none", "1: hand clear at contact and on the approach"),
-        "grasp/rejection": _code(
-            "0 not rejected; insufficient clearance to: 1 the table at contact, 2 the table on the "
-            "approach, 3 a neighbour at contact, 4 a neighbour on the approach",
-            "K",
-        ),
-        "grasp/contact_table_clearance_m": _optional_column(
-            "K", "f8", "m", "table", "height of the lowest point of hand and forearm above the table, at contact"
-        ),
+        "grasp/rejection": _code(_REJECTIONS, "K"),
+        "grasp/contact_table_clearance_m": _optional_column("K", "f8", "m", "table", f"{_HEIGHT}, at contact"),
         "grasp/neighbour_clearance_m": _optional_column(
-            "K",
-            "f8",
-            "m",
-            "table",
-            "signed distance of the hand from the neighbours' convex hulls at contact and on approach, at most 0.1",
+            "K", "f8", "m", "table", "least signed distance of the hand from neighbours' convex hulls, at most 0.1"
         ),
         "grasp/wrist_positions": _wrist("K"),
-        "scene/neighbour_pose": _optional_column(
-            "S M 7", "f8", "m, 1", "table", "poses of the neighbours at rest; names in attribute neighbours"
-        ),
+        "scene/neighbour_pose": _optional_column("S M 7", "f8", "m, 1", "table", _NEIGHBOURS),
     },
     "views": {
         "camera/intrinsics": Column("V 3 3", "f8", "px", "image", "pinhole K; pixel centres at +0.5"),
@@ -189,36 +144,20 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         ),
         "camera/scene_index": Column("V", "i4", "1", "none", "row of the scene in the scene shard"),
         "camera/eye": Column("V", "u1", "enum", "none", "0 mono, 1 left, 2 right"),
-        "camera/stereo_baseline_m": Column(
-            "V", "f8", "m", "camera", "distance between the two cameras of a stereo pair; 0: mono"
-        ),
+        "camera/stereo_baseline_m": Column("V", "f8", "m", "camera", "distance of the cameras of a pair; 0: mono"),
         "image/rgb": Column("V H W 3", "u1", "sRGB", "image", "colour"),
         "image/depth": Column("V H W", "f4", "m", "camera", "distance along the optical axis; inf: no surface"),
         "image/segmentation": Column(
-            "V H W", "u1", "enum", "image", "0 background, 1 table, 2 object, 3 + m: neighbour m"
+            "V H W", "u1", "enum", "image", "0 background, 1 table, 2 object, 3+m neighbour m"
         ),
-        "box/bounding_box_2d_tight": Column(
-            "V 4", "f4", "px", "image", "x_min y_min x_max y_max of the visible object pixels; nan: not visible"
-        ),
-        "box/bounding_box_2d_loose": Column(
-            "V 4", "f4", "px", "image", "x_min y_min x_max y_max of the projected object, occluded or not"
-        ),
+        "box/bounding_box_2d_tight": Column("V 4", "f4", "px", "image", f"{_BOUNDS} visible object; nan: not visible"),
+        "box/bounding_box_2d_loose": Column("V 4", "f4", "px", "image", f"{_BOUNDS} projected object, occluded or not"),
         "box/bounding_box_3d": Column("V 8 3", "f4", "m", "camera", "corners of the object-aligned box"),
-        "box/occlusion_ratio": _optional_column(
-            "V", "f4", "1", "image", "occluded share of the object's pixels; nan: not in view"
-        ),
-        "image/distance": _optional_column(
-            "V H W", "f4", "m", "camera", "distance from the optical centre; inf: no surface"
-        ),
-        "image/normals": _optional_column(
-            "V H W 3", "f2", "1", "table", "unit shading normal, outward; 0 0 0: no surface"
-        ),
-        "image/rgb_hand": _optional_column(
-            "V H W 3", "u1", "sRGB", "image", "colour with the hand in its grasp pose, for display"
-        ),
-        "camera/hand_grasp": _optional_column(
-            "V", "i4", "1", "none", "row, in the scene shard, of the grasp in rgb_hand; -1: none"
-        ),
+        "box/occlusion_ratio": _optional_column("V", "f4", "1", "image", "occluded share of object; nan: not in view"),
+        "image/distance": _optional_column("V H W", "f4", "m", "camera", "distance from optical centre; inf: none"),
+        "image/normals": _optional_column("V H W 3", "f2", "1", "table", "outward unit normal; 0 0 0: no surface"),
+        "image/rgb_hand": _optional_column("V H W 3", "u1", "sRGB", "image", "colour with the hand at its grasp"),
+        "camera/hand_grasp": _optional_column("V", "i4", "1", "none", "row of the grasp in the scene shard; -1: none"),
     },
 }
 
@@ -265,35 +204,21 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "shard_id": RootAttribute("text", "name of the shard in the store"),
     "inputs": RootAttribute("texts", "names of the shards from which this shard was made"),
     "joint_names": RootAttribute("texts", "order of the hand's joints", _BASE),
-    "wrist_joint_names": RootAttribute(
-        "texts",
-        "wrist joints above the hand's root, in the order of `grasp/wrist_positions`; absent if there are none",
-        ("base", "scene"),
-    ),
+    "wrist_joint_names": RootAttribute("texts", "joints of `grasp/wrist_positions`; absent: none", ("base", "scene")),
     "root_link": RootAttribute("text", "link of the hand to which poses refer"),
     "mu": RootAttribute("number", "Coulomb coefficient of `quality/epsilon` and `quality/wrench_volume`", _BASE),
-    "want": RootAttribute(
-        "text", "valid: valid grasps were requested (without validation: feasible); candidates: any grasps", _BASE
-    ),
+    "want": RootAttribute("text", "requested grasps: valid (without validation: feasible) or candidates (all)", _BASE),
     "candidates": RootAttribute("integer", "candidates planned until the last stored grasp", _BASE),
     "outcomes": RootAttribute("text", "JSON: rejected candidates by outcome", _BASE),
     "reason": RootAttribute("text", "why a command found fewer grasps than requested; absent: none are missing", _BASE),
-    "grasps_wanted": RootAttribute("integer", "number of grasps requested, if the command was interrupted", _BASE),
-    "robust": RootAttribute(
-        "text", "JSON: number of perturbed models per valid grasp, and the required share; absent: not requested", _BASE
-    ),
+    "grasps_wanted": RootAttribute("integer", "number of requested grasps, if the command was interrupted", _BASE),
+    "robust": RootAttribute("text", "JSON: perturbed models per valid grasp, required share; absent: none", _BASE),
     "verdict_level": RootAttribute("text", "level of validation; `none`: not validated", _BASE),
-    "verdict_key": RootAttribute(
-        "text", "digest of all settings that affect the verdicts; do not average verdicts with different keys", _BASE
-    ),
-    "scene": RootAttribute(
-        "text", "scene of the grasps, as JSON; absent: planned around a free object", ("base", "scene", "views")
-    ),
+    "verdict_key": RootAttribute("text", "digest of all settings that affect verdicts; average only equal keys", _BASE),
+    "scene": RootAttribute("text", "scene of the grasps, as JSON; absent: planned around a free object"),
     "source": RootAttribute("text", "imported grasps: address or citation of the source", _BASE),
     "licence": RootAttribute("text", "imported grasps: terms of use", _BASE),
-    "base_shard": RootAttribute(
-        "text", "base shard of the grasps that were transferred to the scenes, or planned in them", ("scene", "views")
-    ),
+    "base_shard": RootAttribute("text", "base shard of the grasps in the scenes", ("scene", "views")),
     "scene_shard": RootAttribute("text", "scene shard of the grasps or pictures", ("base", "views")),
     "neighbours": RootAttribute("texts", "names of the neighbours"),
     "neighbour_digests": RootAttribute("texts", "digests of the neighbours' files"),
@@ -306,8 +231,8 @@ def check_known(kind: ShardKind, columns: Iterable[str]) -> None:
         raise InputError(f"{kind} shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them")
 
 
-def check_attributes(kind: str, said: Mapping[str, Attribute]) -> None:
-    for name, value in said.items():
+def check_attributes(kind: str, attributes: Mapping[str, Attribute]) -> None:
+    for name, value in attributes.items():
         known = ATTRIBUTES.get(name)
         if known is None or kind not in known.kinds:
             raise InputError(f"a {kind} shard has no root attribute {name!r}")

@@ -1,4 +1,4 @@
-"""`asset.json`, a small JSON object that workers validate, and corrections of guesses about a hand."""
+"""`asset.json`, a small JSON object in an asset, and corrections of guessed values of a hand."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic_core import from_json, to_json
 from graspd.service.model.base import Model, first_error
 from graspd.service.model.errors import ConflictError, InputError
 
-#: Size limits [bytes] of `asset.json` and of its facts, which lists of assets contain; built-in hands need 2 KB.
+#: Size limits [bytes] of `asset.json` and of its facts, which lists of assets contain; built-in hands have 2 kB.
 MAX_BYTES: Final = 64 << 10
 MAX_FACTS_BYTES: Final = 8 << 10
 _MAX_DEPTH: Final = 6
@@ -29,7 +29,7 @@ def _small(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 class Description(BaseModel):
-    """Keys that the service reads; other keys are stored for the worker."""
+    """Keys of `asset.json` that the service reads. Other keys are for the worker, which validates them."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -43,15 +43,17 @@ class Description(BaseModel):
 
 
 def parse_description(data: bytes, what: str) -> Description:
+    """Parse `asset.json` of the asset `what`; InputError if it is invalid."""
     given = json_object(data, f"{what}: asset.json")
     try:
         return Description.model_validate(given)
     except ValidationError as error:
-        found = first_error(error)
-        raise InputError(f"{what}: asset.json must name the main file and have short facts: {found}") from None
+        problem = first_error(error)
+        raise InputError(f"{what}: asset.json must name the main file and have short facts: {problem}") from None
 
 
 def json_object(text: bytes | str, what: str) -> dict[str, Any]:
+    """Parse a JSON object, named `what` in messages; InputError above limits of size, depth or numbers."""
     data = text.encode(errors="replace") if isinstance(text, str) else text
     if len(data) > MAX_BYTES:
         raise InputError(f"{what} has more than {MAX_BYTES} bytes; leave out what is not needed")
@@ -73,10 +75,10 @@ def _is_plain(value: Any, depth: int) -> bool:
     return not isinstance(value, int) or abs(value) <= _MAX_NUMBER
 
 
-#: Limit far above any hand: the largest in use have about sixty joints.
+#: Limit on joints and fingertips; the largest hands in use have about sixty joints.
 MAX_ENTRIES: Final = 256
 MAX_CENTRE_M: Final = 2.0
-#: Tolerance: numbers in messages and glTF are rounded.
+#: Tolerance for rounded numbers in messages and glTF.
 _ROUNDING: Final = 1e-6
 
 Text = Annotated[str, StringConstraints(min_length=1, max_length=255)]
@@ -87,17 +89,17 @@ Direction = Literal[-1, 0, 1]
 
 
 class PalmCorrection(Model):
-    """Palm in the frame of a link, with the hand in its pre-shape. Missing values are guessed again."""
+    """Palm of the hand in its pre-shape. Missing values are guessed again."""
 
     link: Text
     centre: tuple[Length, Length, Length] | None = Field(
-        None, description="origin of the palm frame, in the frame of `link` [m]"
+        None, description="origin of the palm, in the link's frame [m]"
     )
-    approach: tuple[Share, Share, Share] | None = Field(None, description="direction out of the palm; any length")
+    approach: tuple[Share, Share, Share] | None = Field(None, description="direction out of the palm, of any length")
 
 
 class HandCorrections(Model):
-    """Corrections of wrong guesses about a hand. Missing values stay as found."""
+    """Corrections of guessed values of a hand. Missing values are not corrected."""
 
     palm: PalmCorrection | None = None
     closing: dict[Text, Direction] = Field(
@@ -124,11 +126,11 @@ class HandFacts(BaseModel):
     links: list[str]
     """Links at and below the root."""
     bodies: list[str]
-    """Links among these that are the root or moved by a joint."""
+    """Those of these links that are the root or moved by a joint."""
 
 
 def facts_of(model: bytes) -> HandFacts:
-    """Read the facts in the binary glTF of a hand; ConflictError if an older version made the model."""
+    """Read the facts in the binary glTF of a hand; ConflictError for a model of an older version."""
     try:
         (length,) = struct.unpack("<I", model[12:16])
         document = json.loads(model[20 : 20 + length])
@@ -137,32 +139,30 @@ def facts_of(model: bytes) -> HandFacts:
         return HandFacts.model_validate(extras["facts"] | {"links": list(extras["links"]), "bodies": bodies})
     except (struct.error, ValueError, KeyError, TypeError, ValidationError):
         raise ConflictError(
-            "an older version made the model of this hand, without joint limits and guesses; correct the hand with "
-            "`graspd hands check --write`"
+            "the model of this hand is of an older version, without joint limits; use `graspd hands check --write`"
         ) from None
 
 
 def description_of(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return found or guessed values as keys of `asset.json`: root, palm, pre-shape, closing, fingertips."""
     palm = {"link": facts["root"], "centre": facts["palm_centre"], "approach": facts["palm_approach"]}
-    same = {name: facts[name] for name in ("preshape", "closing", "fingertips")}
-    return {"root": facts["root"], "palm": palm, **same}
+    return {"palm": palm, **{name: facts[name] for name in ("root", "preshape", "closing", "fingertips")}}
 
 
-def apply_corrections(said: Mapping[str, Any], facts: HandFacts, corrections: HandCorrections) -> dict[str, Any]:
-    """Return an `asset.json` with given, found and corrected values; InputError if one is out of range."""
+def apply_corrections(given: Mapping[str, Any], facts: HandFacts, corrections: HandCorrections) -> dict[str, Any]:
+    """Return an `asset.json` with given, found and corrected values; InputError for an invalid correction."""
     _check(facts, corrections)
     found = description_of(facts.model_dump())
-    turned = {name for name, way in corrections.closing.items() if way != facts.closing[name]}
-    found["preshape"] = {name: value for name, value in facts.preshape.items() if name not in turned}
-    found["preshape"] |= corrections.preshape
+    reversed_joints = {joint for joint, sign in corrections.closing.items() if sign != facts.closing[joint]}
+    preshape = {joint: value for joint, value in facts.preshape.items() if joint not in reversed_joints}
+    found["preshape"] = preshape | corrections.preshape
     found["closing"] = facts.closing | corrections.closing
     found["fingertips"] = corrections.fingertips or facts.fingertips
-    kept = dict(said)
+    kept = dict(given)
     if (palm := corrections.palm) is not None:
         kept.pop("approach", None)
-        given = palm.model_dump(exclude_none=True, mode="json")
-        found["palm"] = (found["palm"] if palm.link == facts.root else {}) | given
+        palm_of_root = found["palm"] if palm.link == facts.root else {}
+        found["palm"] = palm_of_root | palm.model_dump(exclude_none=True, mode="json")
     return kept | found
 
 

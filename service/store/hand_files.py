@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import posixpath
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from html import unescape
 from itertools import product
@@ -16,9 +16,8 @@ from graspd.service.model.errors import InputError, LimitError
 from graspd.service.store.assets import MAX_FILES, ZipFiles
 from graspd.service.store.mesh_files import HEAD_BYTES, MESHES, file_references, match_name, read_reference, resolve
 
-#: Descriptions that supplement a hand's URDF; the first takes precedence.
+#: Names of a file that describes the hand besides its URDF; the first name takes precedence.
 DESCRIPTIONS: Final = ("asset.json", "hand.json")
-
 #: Suffixes of a hand's main file; the root element decides the format.
 SUFFIXES: Final = (".urdf", ".xacro", ".xml", ".mjcf")
 #: Suffixes of the files taken from a folder besides its descriptions.
@@ -26,16 +25,15 @@ _TAKEN: Final = (*SUFFIXES, ".yaml", ".yml", ".stl", ".obj", ".ply", ".off", ".g
 _REFERENCE: Final = re.compile(r"""file(?:name)?\s*=\s*["']([^"']+)["']""")
 _FOLDER: Final = re.compile(r"""(?:mesh|asset)dir\s*=\s*["']([^"']*)["']""")
 _MAX_INCLUDED: Final = 32
-#: Folders of main files in a ROS package: meshes are in sibling folders.
+#: Folders of main files in a ROS package; the meshes are in sibling folders.
 _OF_PACKAGES: Final = ("urdf", "robots", "xacro", "mjcf")
 _ABOVE: Final = 4
 
 
 def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
-    """Find a hand's files by relative name, and the name of its main file (empty for a folder).
+    """Find the files of a hand, by name, and the name of its main file ("" for a folder).
 
-    Names are relative to the main file's ROS package, else to its folder. Links to targets outside the
-    hand's folder are ignored.
+    Names are relative to the ROS package of the main file, else to its folder. Links to files outside are ignored.
     """
     files, main = (_files_of_folder(path), "") if path.is_dir() else _files_of_description(path)
     return files | _appearance_files(files, path.resolve() if path.is_dir() else _package(path.resolve())), main
@@ -46,17 +44,14 @@ def _appearance_files(files: Mapping[str, Path], root: Path) -> dict[str, Path]:
     waiting = [name for name in files if name.lower().endswith(MESHES)]
     while waiting and len(files) + len(found) < MAX_FILES:
         mesh = waiting.pop()
-        for reference in file_references(mesh, _head(root / mesh)):
+        with (root / mesh).open("rb") as file:
+            head = file.read(HEAD_BYTES)
+        for reference in file_references(mesh, head):
             name = resolve(mesh, reference, lambda one: _inside(root / one, root))
             if name and name not in files and name not in found:
                 found[name] = root / name
                 waiting += [name] if name.lower().endswith(".mtl") else []
     return found
-
-
-def _head(file: Path) -> bytes:
-    with file.open("rb") as opened:
-        return opened.read(HEAD_BYTES)
 
 
 def _files_of_folder(folder: Path) -> dict[str, Path]:
@@ -82,7 +77,7 @@ def _files_of_description(path: Path) -> tuple[dict[str, Path], str]:
     root = _package(path)
     main = path.relative_to(root).as_posix()
     if path.is_file() and format_of(path.name, path.read_bytes()) == "xacro":
-        # Only the expansion reveals which files a xacro includes.
+        # The files that a xacro includes are unknown until its expansion.
         files = _files_below(root if (root / "package.xml").is_file() else path.parent, root)
     else:
         files = {name: root / name for name in sorted(_referenced_files(path, root))}
@@ -101,17 +96,16 @@ def _package(path: Path) -> Path:
 
 
 def _referenced_files(path: Path, root: Path) -> set[str]:
-    """Return names of files below the root that a description and its includes may refer to."""
-    seen, waiting = {path}, [path]
+    """Return the names of files below the root to which a description and its includes may refer."""
+    seen, waiting, found = {path}, [path], set[str]()
     bases, folders, references = set(), {""}, set()
-    found: set[str] = set()
     while waiting:
         file = waiting.pop()
         text = text_of(file.read_bytes())
         bases.add(file.parent.relative_to(root).as_posix())
         folders |= {unescape(folder) for folder in _FOLDER.findall(text)}
         references |= {unescape(reference) for reference in _REFERENCE.findall(text)}
-        # Names in an included file are relative to its folder or to the description's, depending on the reader.
+        # Names in an included file are relative to its own folder or to the description's, depending on the reader.
         found = {name for parts in product(references, bases, folders) for name in _resolve_names(*parts, root)}
         for name in sorted(found):
             inner = (root / name).resolve()
@@ -131,23 +125,18 @@ def _resolve_names(written: str, base: str, folder: str, root: Path) -> Iterator
 
 
 def _actual_name(name: str, root: Path) -> str:
-    """Return the name of a file below the root in its actual upper and lower case; empty if there is none."""
+    """Return the name of a file below the root in its actual case; "" if there is no such file."""
     if _inside(root / name, root):
         return posixpath.normpath(name)
     at = root
     for part in PurePosixPath(name).parts:
-        like = part if (at / part).exists() else match_name(part, (e.name for e in _entries(at)))
-        if not like:
+        entry = part if (at / part).exists() else ""
+        with suppress(OSError):
+            entry = entry or match_name(part, [other.name for other in at.iterdir()])
+        if not entry:
             return ""
-        at /= like
+        at /= entry
     return at.relative_to(root).as_posix() if _inside(at, root) else ""
-
-
-def _entries(folder: Path) -> Iterable[Path]:
-    try:
-        return list(folder.iterdir()) if folder.is_dir() else []
-    except OSError:
-        return []
 
 
 def _inside(file: Path, root: Path) -> bool:
@@ -155,7 +144,7 @@ def _inside(file: Path, root: Path) -> bool:
 
 
 Format = Literal["urdf", "xacro", "mjcf"]
-#: Size [bytes] of the head that is searched for the root element; no tool writes it later.
+#: Size of the head that is searched for the root element [bytes].
 _HEAD_BYTES: Final = 1 << 16
 _PROLOG: Final = re.compile(r"\s*(?:<\?.*?\?>|<!--.*?-->|<!DOCTYPE(?:[^\[>]|\[.*?\])*>)", re.DOTALL)
 _ROOT: Final = re.compile(r"\s*<([A-Za-z_][\w:.-]*)")
@@ -169,6 +158,7 @@ _NAMED: Final = re.compile(r"iso-?8859|latin|windows-12|cp12|gb|big5|shift|euc|k
 
 
 def format_of(name: str, data: bytes) -> Format | None:
+    """Return the format of a hand file by suffix and root element; None if it is no hand file."""
     suffix = PurePosixPath(name).suffix.lower()
     if suffix not in SUFFIXES:
         return None
@@ -176,29 +166,29 @@ def format_of(name: str, data: bytes) -> Format | None:
     found = _FORMATS_OF.get(_root_element(text[:_HEAD_BYTES]))
     if found == "urdf" and any(sign in _COMMENT.sub("", text) for sign in _MACROS):
         return "xacro"
-    # Without a known root element the suffix decides, so that the reader reports the error in the file.
+    # Without a known root element the suffix decides, and the reader of that format reports the error.
     return found or {".urdf": "urdf", ".xacro": "xacro", ".mjcf": "mjcf"}.get(suffix)  # type: ignore[return-value]
 
 
 def text_of(data: bytes) -> str:
-    """Decode XML or YAML by byte order mark or declaration; strip both. Invalid UTF-8 is read as Latin 1."""
-    coding: str = json.detect_encoding(data)  # The byte order mark, or zeros among the first characters, decides.
-    if (declared := _DECLARED.match(data)) and _NAMED.match(said := declared[1].decode()):
-        coding = said
+    """Decode XML or YAML by byte order mark or declaration, and strip both; invalid UTF-8 is Latin 1."""
+    coding: str = json.detect_encoding(data)  # By byte order mark, or by zeros among the first characters.
+    if (declared := _DECLARED.match(data)) and _NAMED.match(name := declared[1].decode()):
+        coding = name
     try:
         text = data.decode(coding)
     except (UnicodeError, LookupError):
         text = data.decode("latin-1")
-    # A declaration is only valid at the very beginning, but licences often precede it.
+    # A declaration is valid only at the very beginning, but comments with a licence often precede it.
     return _DECLARATION.sub("", text, count=1).strip("\ufeff\0 \t\r\n")
 
 
 def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the hand") -> str:
-    """Return the hand's main file; InputError unless exactly one matches `wanted`, a path or its end."""
+    """Return the name of the main file; InputError unless one file matches `wanted`, a path or its end."""
     known = {name: kind for name in sorted(files) if (kind := format_of(name, _description_head(files, name)))}
     if wanted:
         return _match_name(wanted, [name for name in sorted(files) if name in known or name == wanted], where)
-    # An included part of a xacro description may contain no macros.
+    # A file that a xacro description includes may have no macros.
     kinds_of = {name: "xacro" if name.lower().endswith(".xacro") else kind for name, kind in known.items()}
     for chosen in ("urdf", "xacro", "mjcf"):
         found = [name for name, kind in kinds_of.items() if kind == chosen]
@@ -230,17 +220,19 @@ def _match_name(wanted: str, known: list[str], where: str) -> str:
             raise InputError(
                 f"{where} holds {len(fits)} files called {wanted!r} ({', '.join(fits[:5])}); name one by its path"
             )
-    others = ", ".join(known[:8]) or "none"
-    raise InputError(f"{where} names the file {wanted!r}, which is not there; hand files are: {others}")
+    raise InputError(
+        f"{where} names the file {wanted!r}, which does not exist; hand files are: {', '.join(known[:8]) or 'none'}"
+    )
 
 
 def _outermost_files(files: Mapping[str, bytes], found: list[str]) -> list[str]:
-    contents = {name: text_of(files[name]).lower() for name in found}
-    return [
-        name
-        for name in found
-        if not any(PurePosixPath(name).name.lower() in text for other, text in contents.items() if other != name)
-    ]
+    """Return the files to which no other one refers by name."""
+    texts = {name: text_of(files[name]).lower() for name in found}
+
+    def is_included(name: str) -> bool:
+        return any(PurePosixPath(name).name.lower() in text for other, text in texts.items() if other != name)
+
+    return [name for name in found if not is_included(name)]
 
 
 def _leaves(names: list[str]) -> str:

@@ -1,8 +1,8 @@
 """Checksums of stored objects and of shards in folders; seals inside stored objects.
 
-A seal is the digest of a stored object, computed with zeros in place of the seal's 64 digits. JSON records have it as
-first field `checksum`, a ZIP (also `.npz`) as comment, and a binary glTF in the `extras` of its document. Objects of
-graspd 0.2 have no seal and are read without this check.
+A seal is the SHA-256 of an object, computed with zeros in place of the seal's 64 digits. It is the first field
+`checksum` of a JSON record, the comment of a ZIP or `.npz`, and in the `extras` of a binary glTF. Objects of graspd 0.2
+have no seal and are not checked.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from typing import Any, Final
 from graspd.service.model.errors import DamagedError, DamagedShard, NotFoundError
 from graspd.service.store.store import STREAM_BYTES, Stamp, Store
 
-#: Checksum lists of exports and cards, searched in the folder of a shard and the two above it.
+#: Checksum lists of exports and cards, in the folder of a shard or one of the two folders above.
 CHECKSUM_LISTS: Final = ("SHA256SUMS", "checksums.sha256")
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 _LEVELS: Final = 3
 FIX: Final = "`graspd admin store verify --repair` makes it again where that is possible"
-#: Lifetime of a successful check [s]: bits can change without a new modification time.
+#: Lifetime of a successful check [s], because bits can change without a new modification time.
 _BELIEVED_S: Final = 3600.0
 _REMEMBERED: Final = 100_000
 
 
 def read_checked(store: Store, key: str, sha256: str) -> bytes:
-    """Read a stored object and verify its checksum; DamagedShard if it is missing or does not match."""
+    """Read a stored object and verify its checksum; DamagedShard if it is missing or damaged."""
     try:
         data = store.get(key)
     except NotFoundError:
@@ -56,6 +56,8 @@ def missing_error(key: str) -> DamagedShard:
 
 @dataclass(frozen=True)
 class _Intact:
+    """Successful check of an object: valid while `stamp` is unchanged, `until` a monotonic time [s]."""
+
     stamp: Stamp
     until: float
     size: int
@@ -63,7 +65,7 @@ class _Intact:
 
 
 class CheckedObjects:
-    """Cache of checks of stored objects, valid while size, tag and modification time stay. Thread-safe."""
+    """Cache of checks, valid while size, tag and modification time of an object stay. Thread-safe."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -75,10 +77,7 @@ class CheckedObjects:
         self._intact(key, sha256)
 
     def stream(self, key: str, sha256: str, start: int, length: int) -> Iterator[bytes]:
-        """Yield bytes of a stored object; each block is verified again before any of it is returned.
-
-        Bit rot leaves the modification time unchanged. The call or the iterator raises DamagedShard.
-        """
+        """Yield bytes of a stored object after a new check of each block; may raise DamagedShard."""
         known = self._intact(key, sha256)
         end = min(known.size, start + length)
         chunks = self._blocks(key, sha256, known, start, end)
@@ -122,12 +121,13 @@ def _block_digest(data: bytes) -> bytes:
 
 
 def check_file(path: Path) -> None:
-    """Check a shard in a folder by its manifest or checksum list, if any; once per version of the file."""
+    """Check a shard in a folder against its manifest or checksum list, once per version of the file."""
     if _known.get(path) != _file_stamp(path):
         check_content(path, _expected_checksum(path))
 
 
 def check_content(path: Path, sha256: str | None) -> None:
+    """Check a file once per version; without `sha256` count it as intact. DamagedShard if it is damaged."""
     stamp = _file_stamp(path)
     if _known.get(path) == stamp:
         return
@@ -149,21 +149,18 @@ def _file_stamp(path: Path) -> tuple[int, int, int]:
 
 def _expected_checksum(path: Path) -> str | None:
     path = path.absolute()
-    if (digest := _manifest_checksum(path)) is not None:
-        return digest
-    for folder in list(path.parents)[:_LEVELS]:
-        for name in CHECKSUM_LISTS:
-            sums = folder / name
-            if sums.is_file() and (digest := _hashes(sums, sums.stat().st_mtime_ns).get(str(path.relative_to(folder)))):
-                return digest
-    return None
+    digest = _manifest_checksum(path)
+    for sums in (folder / name for folder in list(path.parents)[:_LEVELS] for name in CHECKSUM_LISTS):
+        if digest is None and sums.is_file():
+            digest = _hashes(sums, sums.stat().st_mtime_ns).get(str(path.relative_to(sums.parent)))
+    return digest
 
 
 def _manifest_checksum(path: Path) -> str | None:
-    """Return the checksum in the manifest next to a file, as in the store's folder."""
+    """Return the checksum in the manifest next to a file; None if there is none for this file."""
     try:
-        said = json.loads(path.with_suffix(".json").read_bytes())
-        digest = said["sha256"] if str(said["key"]).endswith(f"/{path.name}") else None
+        manifest = json.loads(path.with_suffix(".json").read_bytes())
+        digest = manifest["sha256"] if str(manifest["key"]).endswith(f"/{path.name}") else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return digest if isinstance(digest, str) and _DIGEST.fullmatch(digest) else None
@@ -180,9 +177,9 @@ _DIGITS: Final = re.compile(rb"[0-9a-f]{64}")
 _JSON: Final = b'{"checksum":"'
 _GLB: Final = b'{"extras":{"checksum":"'
 _ZIP: Final = b"sha256:"
-#: Size of a binary glTF's header and of the header of its first chunk [bytes].
+#: Size of the headers of a binary glTF and of its first chunk [bytes].
 _GLB_AT: Final = 20
-#: The seal's digits are still found if at most this many bytes were inserted before them.
+#: Largest number of bytes inserted before a seal with which the seal is still found, and counts as damaged.
 _SLACK: Final = 4
 _END: Final = struct.Struct("<4s4H2LH")
 _END_MARK: Final = b"PK\x05\x06"
@@ -193,7 +190,7 @@ def put_sealed(store: Store, key: str, data: bytes) -> bool:
 
 
 def get_sealed(store: Store, key: str) -> bytes:
-    """Read a stored object and verify its seal, if it has one; DamagedError if that does not match."""
+    """Read a stored object and verify its seal, if any; DamagedError if the seal does not match."""
     data = store.get(key)
     is_sealed(key, [data], len(data))
     return data
@@ -204,19 +201,19 @@ def put_document(store: Store, key: str, document: Mapping[str, Any]) -> bool:
 
 
 def get_document(store: Store, key: str) -> dict[str, Any]:
-    """Read the JSON object of `put_document`; errors as in `get_sealed`, DamagedError for other content."""
+    """Read the JSON object of `put_document`; DamagedError for a wrong seal or other content."""
     try:
-        found = json.loads(get_sealed(store, key))
+        document = json.loads(get_sealed(store, key))
     except ValueError:
-        found = None
-    if not isinstance(found, dict):
+        document = None
+    if not isinstance(document, dict):
         raise _damaged(key)
-    found.pop("checksum", None)
-    return found
+    document.pop("checksum", None)
+    return document
 
 
 def add_seal(key: str, data: bytes) -> bytes:
-    """Return the bytes with a seal; formats other than JSON object, ZIP and glTF are unchanged."""
+    """Return the bytes with a seal; other formats than JSON object, ZIP and glTF are unchanged."""
     if key.endswith(".json") and data[:1] == b"{":
         data, at = _JSON + _ZEROS + b'",' + data[1:], len(_JSON)
     elif key.endswith(".glb") and data[:4] == b"glTF" and data[_GLB_AT : _GLB_AT + 1] == b"{":
@@ -231,6 +228,7 @@ def add_seal(key: str, data: bytes) -> bytes:
 
 
 def seal_archive(file: BufferedRandom) -> None:
+    """Add a seal to an open ZIP without a comment."""
     comment = _ZIP + _ZEROS
     file.seek(-2, 2)
     file.write(struct.pack("<H", len(comment)) + comment)
@@ -241,7 +239,7 @@ def seal_archive(file: BufferedRandom) -> None:
 
 
 def is_sealed(key: str, chunks: Iterable[bytes], size: int) -> bool:
-    """Check a seal; return False if there is none (graspd 0.2). DamagedError if it does not match."""
+    """Check a seal; return False without a seal (graspd 0.2). DamagedError if the seal does not match."""
     is_zip = key.endswith((".zip", ".npz"))
     before, start = (_GLB, _GLB_AT) if key.endswith(".glb") else (_JSON, 0)
     at = size - len(_ZEROS) if is_zip else start + len(before)
@@ -267,15 +265,13 @@ def is_sealed(key: str, chunks: Iterable[bytes], size: int) -> bool:
 
 
 def _damaged(key: str) -> DamagedError:
-    return DamagedError(
-        f"{key} in the store is damaged: its bytes do not match its checksum; put a copy in its place, or run "
-        "`graspd admin store verify --repair`"
-    )
+    problem = f"{key} in the store is damaged: its bytes do not match its checksum"
+    return DamagedError(f"{problem}; put a copy in its place, or run `graspd admin store verify --repair`")
 
 
 def _without_digits(chunk: bytes, at: int) -> bytes:
     first, last = max(0, at), min(len(chunk), at + len(_ZEROS))
-    return chunk if first >= last else chunk[:first] + b"0" * (last - first) + chunk[last:]
+    return chunk if first >= last else chunk[:first] + _ZEROS[: last - first] + chunk[last:]
 
 
 def _with_blank_checksum(data: bytes) -> bytes:

@@ -20,14 +20,14 @@ from graspd.service.store.records import Put, put_record, read_record
 from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
-#: Size limit [bytes] of an unpacked archive, against a manipulated store; uploads have their own limit.
+#: Size limit of an unpacked archive [bytes], in case the store was manipulated; uploads have another limit.
 UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
 
 
 def publish_asset(
     store: Store, kind: AssetKind, name: str, files: Mapping[str, bytes], said: Mapping[str, object] | None = None
 ) -> Asset:
-    """Publish a hand or object idempotently: archive by `store_files`, then record by `record_asset`."""
+    """Store the archive and then the record of a hand or object; a repeated call changes nothing."""
     return record_asset(store, store_files(store, kind, name, files, said))
 
 
@@ -36,7 +36,7 @@ def store_files(
 ) -> Asset:
     """Store the archive of an asset, which readers do not see yet; InputError for an invalid `asset.json`.
 
-    `said` are further fields of the record. Private files contain their project's mark (`service.model.projects`).
+    `said` are further fields of the record. Private files include the mark of their project (`model.projects`).
     """
     asset = create_asset(kind, name, files, created=timestamp()).model_copy(update=dict(said or {}))
     with tempfile.TemporaryFile() as archive:
@@ -58,16 +58,16 @@ def _is_damaged(store: Store, key: str) -> bool:
 
 
 def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
-    """Write the record, by `put` if given. ConflictError: content has another name, or is being removed."""
+    """Write the record, by `put` if given; ConflictError for known content with another name or deletion."""
     record = names.asset_record_key(asset.kind, asset.digest)
-    new = put(record, asset) if put is not None else put_record(store, record, asset)
+    is_new = put(record, asset) if put is not None else put_record(store, record, asset)
     if store.exists(names.deletion_key(asset.kind.value, asset.digest)):
-        if new:
+        if is_new:
             store.delete(record)
         raise ConflictError(
-            f"the same {asset.kind.value}, deleted before, is still being removed; try again in a moment"
+            f"the same {asset.kind.value} was deleted and is still being removed; try again in a moment"
         )
-    if new:
+    if is_new:
         return asset
     known = load_asset(store, asset.kind, asset.digest)
     if known.name != asset.name:
@@ -80,27 +80,27 @@ def builtin_assets() -> list[Asset]:
 
 
 def publish_builtins(store: Store) -> list[Asset]:
+    """Publish all built-in assets and their models; log and omit damaged records."""
     published = []
-    for kind in AssetKind:
-        for name in builtin_names(kind):
-            asset, files = builtin_asset(kind, name)
-            try:
-                published.append(publish_asset(store, kind, name, files, {"builtin": True, "created": asset.created}))
-            except DamagedError as error:
-                log.warning("the built-in %s %s cannot be used: %s", kind.value, name, error)
-            key = names.asset_model_key(kind, asset.digest)
-            model = add_seal(key, builtin_model(kind, name))
-            # The model depends on code and asset: a model of an older version is replaced.
-            if not store.put(key, model) and store.get(key) != model:
-                store.delete(key)
-                store.put(key, model)
+    for kind, name in [(one, name) for one in AssetKind for name in builtin_names(one)]:
+        asset, files = builtin_asset(kind, name)
+        try:
+            published.append(publish_asset(store, kind, name, files, {"builtin": True, "created": asset.created}))
+        except DamagedError as error:
+            log.warning("the built-in %s %s cannot be used: %s", kind.value, name, error)
+        key = names.asset_model_key(kind, asset.digest)
+        model = add_seal(key, builtin_model(kind, name))
+        # The model depends on code and asset: a model of an older version is replaced.
+        if not store.put(key, model) and store.get(key) != model:
+            store.delete(key)
+            store.put(key, model)
     return published
 
 
 def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:
     records = [entry.key.split("/") for entry in store.list(names.ASSETS)]
     gone = {entry.key for entry in store.list(names.DELETIONS)}
-    # Other files of an asset may have deeper keys, such as an object's convex pieces.
+    # Other files of an asset may have deeper keys, such as the convex pieces of an object.
     found = [key for key in records if len(key) == 4 and key[1] in set(AssetKind) and key[3] == "asset.json"]
     return [(AssetKind(key[1]), key[2]) for key in found if names.deletion_key(key[1], key[2]) not in gone]
 

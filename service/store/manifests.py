@@ -1,4 +1,4 @@
-"""Manifest of a shard: written last and create-only; it has all data that the index needs."""
+"""Manifests of shards, written last and create-only, with all data for the index."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ INDEX_THRESHOLD_M: Final = 0.005
 
 @insert_fields(valid=value_fields(optional=False, default=None), last=value_fields(optional=True, default=None))
 class GraspSummary(Record):
-    """Quality of one grasp, in the units of the shard's columns; None for nan."""
+    """Quality of one grasp, in the units of the shard's columns; None replaces nan."""
 
     valid: bool
     success: bool | None = None
-    verdict_level: str | None = Field(None, description="level of the validator that gave `success`")
+    verdict_level: str | None = Field(None, description="level of validation of `success`")
     lift_hard: bool | None = Field(None, description="in a scene: lifted at half friction")
     robust_weakest: str | None = Field(
-        None, description="perturbed parameter of the first model in which it fails; None: held in all, or not tested"
+        None, description="perturbed parameter of the first failed model; None: held in all models, or not tested"
     )
 
 
@@ -52,7 +52,7 @@ class ShardManifest(Record):
     key: str
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
     size_bytes: int = Field(gt=0)
-    counts: dict[str, int] = Field(description="lengths of the shard's axes: N grasps, S scenes, K pairs, V views, ...")
+    counts: dict[str, int] = Field(description="lengths of the shard's axes: N grasps, S scenes, K pairs, V views")
     hand: str
     object: str
     hand_digest: Digest
@@ -71,9 +71,7 @@ class ShardManifest(Record):
     worker: str
     valid: int = Field(0, description="base: valid grasps; scene: pairs of grasp and scene in which the hand is clear")
     candidates: int = Field(0, ge=0, description="candidates planned for this base shard, stored or not")
-    rechecked: int = Field(
-        0, ge=0, description="valid grasps validated again under the unmodified DexGraspBench protocol"
-    )
+    rechecked: int = Field(0, ge=0, description="valid grasps validated again at level `dexgraspbench`")
     recheck_held: int = Field(0, ge=0, description="rechecked grasps that held")
     index_threshold_m: float | None = None
     grasps: tuple[GraspSummary, ...] = ()
@@ -95,12 +93,13 @@ class ShardManifest(Record):
 
     @property
     def validated(self) -> int:
-        """Number of candidates tested against the geometric limits and by a validator; 0 without validator."""
+        """Number of candidates tested against the geometric limits and in validation; 0 without validation."""
         has_verdicts = any(grasp.success is not None for grasp in self.grasps)
         return self.candidates if has_verdicts or (not self.grasps and self.request.validation != "none") else 0
 
     @property
     def count(self) -> int:
+        """Number of grasps, views, scenes, or pairs of grasp and scene, according to the kind."""
         scenes = "S" if self.request.in_scene else "K"
         return self.counts.get({"base": "N", "scene": scenes, "views": "V"}[self.kind], 0)
 
@@ -117,7 +116,9 @@ def manifest_of(
     worker: str,
     info: Mapping[str, Any] | None = None,
 ) -> ShardManifest:
+    """Return the manifest of the result of a task: `data` are the bytes of the shard, `counts` its axes."""
     kind = names.SHARD_KINDS[message.stage]
+    shared = {name: getattr(message, name) for name in ("hand_digest", "object_digest", "request", "batch", "inputs")}
     return ShardManifest(
         shard_id=message.output,
         stage=message.stage,
@@ -128,13 +129,8 @@ def manifest_of(
         counts=dict(counts),
         hand=message.request.hand,
         object=message.request.object,
-        hand_digest=message.hand_digest,
-        object_digest=message.object_digest,
-        request=message.request,
         seed=message.request.seed,
-        batch=message.batch,
         batches=count_batches(message.count),
-        inputs=message.inputs,
         code_version=PACKAGE_VERSION,
         stage_revision=STAGE_REVISIONS[message.stage],
         shard_schema=schema_of(kind),
@@ -143,6 +139,7 @@ def manifest_of(
         seconds=round(seconds, 4),
         worker=worker,
         info=dict(info or {}),
+        **shared,
         **_contents(kind, arrays, attributes),
     )
 
@@ -162,7 +159,7 @@ def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping
 def _summaries(
     arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
 ) -> tuple[float, tuple[GraspSummary, ...]]:
-    """Return the contact threshold nearest to `INDEX_THRESHOLD_M` [m], and each grasp's quality at it."""
+    """Return the contact threshold nearest to `INDEX_THRESHOLD_M` [m], and the quality of grasps at it."""
     thresholds = np.asarray(arrays["quality/thresholds_m"], float)
     at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
     count = len(arrays["quality/valid"])
@@ -172,19 +169,19 @@ def _summaries(
         if not metric.optional or metric.path in arrays
     }
     columns["valid"] = validity.valid_mask(arrays).tolist()
-    columns["success"] = [_verdict(int(v)) for v in arrays.get("quality/success", np.full(count, -1))]
+    for name in ("success", "lift_hard"):
+        columns[name] = [_verdict(int(v)) for v in arrays.get(f"quality/{name}", np.full(count, -1))]
     level = attributes.get("verdict_level")
     columns["verdict_level"] = [None if verdict is None else level for verdict in columns["success"]]
-    columns["lift_hard"] = [_verdict(int(v)) for v in arrays.get("quality/lift_hard", np.full(count, -1))]
     columns["robust_weakest"] = [axis_word(int(v)) for v in arrays.get("quality/robust_weakest", np.zeros(count))]
     rows = zip(*columns.values(), strict=True)
     return float(thresholds[at]), tuple(GraspSummary(**dict(zip(columns, row, strict=True))) for row in rows)
 
 
 def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
-    """Store a shard, manifest last; return False if it exists already, which is also success."""
+    """Store a shard, its manifest last; return False if it exists already, which is no error."""
     if not store.put(manifest.key, data):
-        # After concurrent writes, or a kill between the two writes, the manifest describes the bytes in the store.
+        # Another process or an earlier attempt may have written the file: the manifest describes the stored bytes.
         manifest = rebuild_manifest(manifest.model_dump(mode="json"), store.get(manifest.key))
     return put_record(store, names.shard_manifest_key(manifest.stage, manifest.shard_id), manifest)
 
@@ -203,11 +200,11 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
 
 
 def rebuild_manifest(said: Mapping[str, Any], data: bytes) -> ShardManifest:
-    """Rebuild the manifest of the file `data`; other fields come from its existing manifest `said`."""
+    """Return the manifest of the shard `data`; other fields come from the existing manifest `said`."""
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
     shard = read_shard(data, without=pictures, name=said["key"])
-    told = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}
-    return ShardManifest.model_validate({**said, **told, **_contents(said["kind"], shard.arrays, shard.attributes)})
+    file = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}
+    return ShardManifest.model_validate({**said, **file, **_contents(said["kind"], shard.arrays, shard.attributes)})
 
 
 def _verdict(value: int) -> bool | None:

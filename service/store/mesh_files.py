@@ -15,7 +15,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.store.assets import check_path
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(/*)")
-#: Schemes of names whose first folders (a package, or folders of another machine) are optional.
+#: Schemes of names whose first folders are optional: a package, or folders of another machine.
 _OURS: Final = frozenset({"package", "model", "file"})
 
 
@@ -28,10 +28,10 @@ class Reference:
 
 
 def read_reference(written: str, base: str) -> Reference:
-    """Resolve a name with slashes, backslashes, spaces or `%20`; InputError's text follows the name.
+    """Resolve a name with slashes, backslashes, spaces or `%20`; the text of InputError lacks the name.
 
-    A ROS package may be packed with or without its folder and parent folders, and next to other packages.
-    `package://NAME/a/b.stl` is NAME/a/b.stl, a/b.stl or b.stl, from the description's folder or from the top.
+    A ROS package may be packed with or without its folder and parent folders: `package://NAME/a/b.stl` is NAME/a/b.stl,
+    a/b.stl or b.stl, relative to the folder of the description or to the top.
     """
     text = written.strip().replace("\\", "/")
     found = _SCHEME.match(text)
@@ -39,7 +39,7 @@ def read_reference(written: str, base: str) -> Reference:
     if found and scheme not in _OURS:
         raise InputError("is no file of this hand; put it beside the URDF")
     rest = text[found.end() :] if found else text
-    # A package is not below the description's folder: `..` in its path is relative to the package.
+    # `..` in a name with a scheme is relative to the package, otherwise to the folder of the description.
     paths = [_inside(rest, "" if scheme else base)]
     with suppress(InputError):
         paths += [_inside(unquote(rest), "" if scheme else base)]
@@ -49,8 +49,8 @@ def read_reference(written: str, base: str) -> Reference:
 
 
 def match_name(name: str, files: Iterable[str]) -> str:
-    wanted = name.lower()
-    like = [file for file in files if file.lower() == wanted]
+    """Return the only one of the files with this name in any case; "" if there are none or several."""
+    like = [file for file in files if file.lower() == name.lower()]
     return like[0] if len(like) == 1 else ""
 
 
@@ -60,7 +60,7 @@ def _path_suffixes(path: str) -> list[str]:
 
 
 def _inside(path: str, base: str) -> str:
-    """Resolve `../meshes/x` against a folder if the result stays inside the upload."""
+    """Resolve `../meshes/x` relative to a folder; InputError if the result is outside the upload."""
     dots = ".." in path and not path.startswith("/")
     try:
         return check_path(posixpath.normpath(posixpath.join(base, path)) if dots else path)
@@ -68,7 +68,7 @@ def _inside(path: str, base: str) -> str:
         raise InputError("lies outside the hand's folder; put it inside") from None
 
 
-#: Maximum number of names that are read from one file; a material library has fewer.
+#: Maximum number of names read from one file; material libraries have fewer.
 MAX_NAMES: Final = 64
 HEAD_BYTES: Final = 2**20
 _SPACES: Final = rb"[ \t]+"
@@ -83,12 +83,9 @@ _TAKEN: Final = (".mtl", *_PICTURES)
 
 
 def file_references(name: str, data: bytes) -> list[str]:
-    """Return the texture and material files named in a mesh or library, as written; limited in number."""
+    """Return at most `MAX_NAMES` names of textures and materials, as written in a mesh or a library."""
     pattern = _NAMED_BY.get(PurePosixPath(name).suffix.lower())
-    if pattern is None:
-        return []
-    said = pattern.findall(data[:HEAD_BYTES])[:MAX_NAMES]
-    return [reference_of(text) for text in said]
+    return [reference_of(text) for text in pattern.findall(data[:HEAD_BYTES])[:MAX_NAMES]] if pattern else []
 
 
 def reference_of(text: bytes) -> str:
@@ -97,18 +94,18 @@ def reference_of(text: bytes) -> str:
 
 
 def resolve(name: str, reference: str, there: Callable[[str], bool]) -> str | None:
-    """Resolve a mesh's reference by path or name in its folder; None if no picture or library is `there`."""
-    folder = posixpath.dirname(name)
-    said = reference.replace("\\", "/").partition("://")[2] or reference.replace("\\", "/")
-    if not said.lower().endswith(_TAKEN) or "\0" in said:
+    """Resolve a reference of mesh `name` by path, or by name in its folder; None if no file is `there`."""
+    folder, path = posixpath.dirname(name), reference.replace("\\", "/")
+    path = path.partition("://")[2] or path
+    if not path.lower().endswith(_TAKEN) or "\0" in path:
         return None
-    tries = [] if said.startswith("/") else [posixpath.normpath(posixpath.join(folder, said))]
-    tries.append(posixpath.join(folder, posixpath.basename(said)))
+    tries = [] if path.startswith("/") else [posixpath.normpath(posixpath.join(folder, path))]
+    tries.append(posixpath.join(folder, posixpath.basename(path)))
     return next((one for one in tries if not one.startswith(("..", "/")) and there(one)), None)
 
 
 def appearance_files(name: str, files: Mapping[str, bytes]) -> list[str]:
-    """Return the names of the files that define a mesh's appearance, libraries before pictures."""
+    """Return the names of the files that define the appearance of a mesh: libraries, then pictures."""
     found: list[str] = []
     for reference in file_references(name, files[name]):
         one = resolve(name, reference, files.__contains__)

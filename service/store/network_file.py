@@ -1,7 +1,7 @@
 """Files of proposal networks: `.npz` of schema `graspd/proposals@1`, arrays and a JSON text, no code.
 
-The architecture is fixed, so the number of joints decides the shape of every array. `baselines.learned.network`
-evaluates the network.
+The architecture is fixed: the number of joints decides the shapes of all arrays. `baselines.learned.network` evaluates
+the network.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from graspd.service.store.assets import asset_json
 from graspd.service.store.descriptions import json_object, parse_description
 
 SCHEMA: Final = "graspd/proposals@1"
-#: Size limit [bytes] of a file, packed or unpacked; a network of 22 joints takes 5.4 MB.
+#: Size limit of a file [bytes], packed or unpacked; a network of 22 joints takes 5.4 MB.
 MAX_BYTES: Final = 64 << 20
 #: Number of point features, and widths of the encoder's layers before the maximum over points.
 ENCODER: Final = (7, 64, 128, 256)
@@ -37,13 +37,13 @@ CONDITION: Final = FEATURE + 2
 TIME_FEATURES: Final = 8
 HIDDEN: Final = 512
 BLOCKS: Final = 2
-#: Numbers of a grasp besides its joints: position, two columns of the rotation, approach direction.
+#: Number of values of a grasp besides its joints: position, two columns of the rotation, approach direction.
 POSE: Final = 12
 _META: Final = "meta"
 _SHARED: Final = ("hand", "hand_digest", "joint_names", "points", "steps", "about")
-#: Exceptions for bytes that are no archive of arrays.
+#: Exceptions of the readers for bytes that are no archive of arrays.
 _BROKEN: Final = (OSError, ValueError, EOFError, KeyError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
-#: A text array takes four bytes per character; each array has a header.
+#: Size limits of the text array (four bytes per character) and of the header of an array [bytes].
 _MOST_META: Final = 4 * (64 << 10)
 _HEADER: Final = 4096
 Floats32 = NDArray[np.float32]
@@ -72,7 +72,7 @@ class _Meta(BaseModel):
 
 @dataclass(frozen=True)
 class ProposalNetwork:
-    """Conditional flow that proposes grasps of a hand from a cloud; J joints, D = 12 + 3 J values a grasp."""
+    """Conditional flow that proposes grasps from a point cloud; J joints, D = 12 + 3 J values per grasp."""
 
     hand: str
     hand_digest: str
@@ -81,7 +81,7 @@ class ProposalNetwork:
     weights: Mapping[str, Floats32]
     """Arrays with the names of `weight_shapes`; `.weight` (out, in) and `.bias` (out,), as in torch's `Linear`."""
     mean: Floats32
-    """(D,) mean of the training grasps; `mean` and `std` standardise the numbers."""
+    """(D,) mean of the training grasps."""
     std: Floats32
     """(D,) standard deviation of the training grasps, positive."""
     points: int = 512
@@ -122,8 +122,7 @@ def to_bytes(network: ProposalNetwork) -> bytes:
     """Serialise a network; InputError if `from_bytes` would reject it."""
     joints = len(network.joint_names)
     try:
-        shared = {name: getattr(network, name) for name in _SHARED}
-        meta = _Meta(schema=SCHEMA, sizes=sizes(joints), **shared)
+        meta = _Meta(schema=SCHEMA, sizes=sizes(joints), **{name: getattr(network, name) for name in _SHARED})
     except ValidationError as error:
         raise InputError(f"the network cannot be written: {first_error(error)}") from None
     found = {"mean": network.mean, "std": network.std, **network.weights}
@@ -136,6 +135,7 @@ def to_bytes(network: ProposalNetwork) -> bytes:
 
 
 def read_file(path: Path) -> bytes:
+    """Read a file; InputError if it is unreadable, LimitError if it is too large for a network."""
     try:
         with Path(path).open("rb") as file:
             data = file.read(MAX_BYTES + 1)
@@ -162,9 +162,8 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
     _check(arrays, joints, what)
     for array in arrays.values():
         array.flags.writeable = False
-    weights = {name: arrays[name] for name in weight_shapes(joints)}
-    shared = {name: getattr(meta, name) for name in _SHARED}
-    return ProposalNetwork(weights=weights, mean=arrays["mean"], std=arrays["std"], **shared)
+    mean, std = arrays.pop("mean"), arrays.pop("std")
+    return ProposalNetwork(weights=arrays, mean=mean, std=std, **{name: getattr(meta, name) for name in _SHARED})
 
 
 def check_size(size: int, what: str) -> None:
@@ -189,11 +188,11 @@ def _read_meta(archive: zipfile.ZipFile, what: str) -> _Meta:
 
 
 def _read(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], what: str) -> Floats32:
-    """Read an array after a check of its header against the schema."""
+    """Read an array whose header matches the schema."""
     data = _member(archive, name, 4 * int(np.prod(shape)) + _HEADER)
-    stands, dtype = _header(data)
-    if stands != shape or dtype != np.dtype("<f4"):
-        raise InputError(f"{what}: {name} is {dtype.name} {stands}; {SCHEMA} has float32 {shape}")
+    found, dtype = _header(data)
+    if found != shape or dtype != np.dtype("<f4"):
+        raise InputError(f"{what}: {name} is {dtype.name} {found}; {SCHEMA} has float32 {shape}")
     return np.asarray(npy.read_array(io.BytesIO(data), allow_pickle=False), np.float32)
 
 
@@ -238,16 +237,17 @@ NETWORK_FILE: Final = "network.npz"
 
 
 def network_bytes(files: Mapping[str, bytes], what: str) -> bytes:
-    """Return the network's file of an asset; InputError if missing, or if `asset.json` has other keys."""
-    described = parse_description(asset_json(files), what)
-    if described.file not in files:
-        raise InputError(f"{what}: the main file {described.file!r} is not among its files")
-    if extra := sorted(described.model_extra or {}):
+    """Return the network in an asset; InputError if it is missing, or if `asset.json` has unknown keys."""
+    description = parse_description(asset_json(files), what)
+    if description.file not in files:
+        raise InputError(f"{what}: the main file {description.file!r} is not among its files")
+    if extra := sorted(description.model_extra or {}):
         raise InputError(f"{what}: a network has no {extra[0]!r}; it may have a description, a licence and a source")
-    return files[described.file]
+    return files[description.file]
 
 
 def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
+    """Return the report of the check of a network; InputError if it is refused."""
     data = network_bytes(files, name)
     network = from_bytes(data, name)
     joints = len(network.joint_names)
@@ -258,8 +258,7 @@ def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
         "points": network.points,
         "steps": network.steps,
         "about": "".join(letter for letter in " ".join(network.about.split()) if letter.isprintable()),
-        # Digest of the file in shards of `graspd synth`.
-        "file_digest": digest_bytes(data),
+        "file_digest": digest_bytes(data),  # Also in shards of `graspd synth`.
     }
     message = f"{name}: proposes grasps of {network.hand} ({network.hand_digest[:12]}), {joints} joints"
     return {"verdict": "accept", "message": message, "repairs": [], "facts": facts}

@@ -1,4 +1,4 @@
-"""Sets of objects from a folder or archive of meshes; the layouts of YCB and EGAD are detected."""
+"""Sets of objects from a folder or ZIP of meshes; the layouts of YCB and EGAD are detected."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ from graspd.service.model.names import shorten
 from graspd.service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
 
 SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb")
-#: Preferred file stems if an object has several meshes: closed and cleaned scans first.
+#: Stems of mesh files in order of preference, if an object has several meshes: closed and cleaned scans first.
 PREFERRED: Final = ("clean", "nontextured", "textured_simple", "textured", "collision", "visual", "raw")
-#: Inner folders of an object that name the processing of the mesh, not the object.
+#: Names of inner folders that describe the processing of a mesh, not the object.
 _INNER: Final = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "clouds", "meshes", "mesh", "visual")
-
 
 Objects = dict[str, dict[str, bytes]]
 
@@ -28,7 +27,7 @@ def files_of_set(path: Path) -> Objects | None:
     if not path.is_dir() and not (path.suffix.lower() == ".zip" and path.is_file()):
         return None
     files = read_set(path, limit_bytes=UNPACK_FACTOR * load_settings().max_upload_bytes)
-    # An `asset.json` at the top means one object, for any number of meshes.
+    # With `asset.json` at its top, a ZIP is one object with any number of meshes.
     if path.is_file() and "asset.json" in files:
         return None
     found = object_set(files)
@@ -36,7 +35,7 @@ def files_of_set(path: Path) -> Objects | None:
 
 
 def object_set(files: Mapping[str, bytes]) -> Objects:
-    """Group files by objects of a set; return sorted names, each with its mesh and `asset.json`, if any."""
+    """Group the files of a set by object: sorted names, each with its mesh and `asset.json`, if any."""
     meshes = sorted(name for name in files if PurePosixPath(name).suffix.lower() in SUFFIXES)
     if not meshes:
         raise InputError(f"no mesh among {len(files)} files; a set holds {', '.join(SUFFIXES)}")
@@ -46,7 +45,7 @@ def object_set(files: Mapping[str, bytes]) -> Objects:
     top = _common_folders(owners)
     chosen: dict[str, str] = {}
     for owner, names in owners.items():
-        # EGAD: each mesh of one folder is an object; YCB: each object has a folder, perhaps with variants of its mesh.
+        # EGAD: each mesh of one folder is an object. YCB: each object has a folder with variants of its mesh.
         is_object = len(owner) > len(top) and _are_variants(names)
         for name in [min(names, key=_rank)] if is_object else names:
             parts = owner[len(top) :] if is_object else (*owner[len(top) :], PurePosixPath(name).stem)
@@ -78,7 +77,7 @@ def _owner(mesh: str) -> tuple[str, ...]:
 
 
 def _common_folders(owners: Mapping[tuple[str, ...], list[str]]) -> tuple[str, ...]:
-    """Return the common leading folders; for a single object the parent, so that its folder names it."""
+    """Return the common leading folders; for a single object without its own folder, which has its name."""
     folders = list(owners)
     if len(folders) == 1:
         return folders[0][:-1] if _are_variants(owners[folders[0]]) else folders[0]
@@ -86,7 +85,7 @@ def _common_folders(owners: Mapping[tuple[str, ...], list[str]]) -> tuple[str, .
 
 
 def _are_variants(names: list[str]) -> bool:
-    """Check whether a folder's meshes belong to one object: a single mesh, or names of processing steps."""
+    """Check whether the meshes of a folder are one object: a single mesh, or names of processing steps."""
     stems = [PurePosixPath(name).stem.lower() for name in names]
     return len(stems) == 1 or any(stem in PREFERRED for stem in stems)
 
@@ -106,6 +105,5 @@ def _name(text: str, taken: Mapping[str, str]) -> str:
 
 def _files_of(files: Mapping[str, bytes], mesh: str) -> dict[str, bytes]:
     path = PurePosixPath(mesh)
-    found = {path.name: files[mesh]}
-    beside = str(path.parent / "asset.json")
-    return found | ({"asset.json": files[beside]} if beside in files else {})
+    paths = {path.name: mesh, "asset.json": str(path.parent / "asset.json")}
+    return {name: files[file] for name, file in paths.items() if file in files}

@@ -1,7 +1,7 @@
 """Conversion of packs of graspd 0.2 (many shards in one file) to a file per shard.
 
-A pack has a head (magic bytes and the length of the directory), the directory, the manifests and the files. Its name is
-the digest of its directory, which has the SHA-256 of each manifest and file. Records beside it list its deleted shards.
+A pack has a head (magic bytes and length of the directory), the directory, manifests and files. Its name is the digest
+of its directory, which has the SHA-256 of each manifest and file. Other records list the deleted shards of a pack.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _HEAD: Final = struct.Struct("<8sQ")
 
 
 class _Packed(Record):
-    """Positions of a shard's manifest and file after the directory [bytes], with their checksums."""
+    """Positions of a shard's file and manifest after the directory [bytes], with checksums."""
 
     id: Digest
     stage: Stage
@@ -52,17 +52,16 @@ def has_packs(store: Store) -> bool:
 def unpack_all(store: Store) -> Iterator[ShardManifest]:
     """Replace each pack by a file and a manifest per shard; yield the manifests.
 
-    An interrupted call can be repeated. Damaged packs are moved to `damaged/`. For a damaged file only the manifest is
-    stored, so that its replacement must match the checksum.
+    An interrupted call can be repeated. Damaged packs move to `damaged/`. The manifest of a damaged file is stored,
+    so that its replacement must match the checksum.
     """
     keys = sorted(entry.key for entry in store.list(_FOLDER))
-    for key in keys:
-        if key.endswith(".pack"):
-            beside = key.removesuffix(".pack") + ".dead/"
-            yield from _unpack(store, key, [one for one in keys if one.startswith(beside)])
-    for key in keys:
-        if not key.endswith(".pack"):
-            store.delete(key)
+    packs = [key for key in keys if key.endswith(".pack")]
+    for pack in packs:
+        dead = pack.removesuffix(".pack") + ".dead/"
+        yield from _unpack(store, pack, [key for key in keys if key.startswith(dead)])
+    for key in set(keys) - set(packs):
+        store.delete(key)
 
 
 def _unpack(store: Store, key: str, dead: list[str]) -> Iterator[ShardManifest]:
@@ -71,26 +70,24 @@ def _unpack(store: Store, key: str, dead: list[str]) -> Iterator[ShardManifest]:
         gone = {shard for record in dead for shard in json.loads(store.get(record))["shards"]}
         body, shards = _directory(key, data)
     except NotFoundError:
-        return  # Another process has converted the pack.
+        return  # Another process converted the pack.
     except (DamagedError, ValueError, LookupError, TypeError) as error:
         log.error("the pack %s is damaged, and moved aside: %s", key, error)
         store.set_aside(key)
         return
     whole = True
-    for shard in shards:
-        if shard.id in gone:
-            continue
+    for shard in (shard for shard in shards if shard.id not in gone):
         manifest = _piece(data, body + shard.manifest_start, shard.manifest_length, shard.manifest_sha256)
         file = _piece(data, body + shard.start, shard.length, shard.sha256)
         whole = whole and manifest is not None and file is not None
         if manifest is None:
             continue
-        made = parse_record(ShardManifest, manifest, f"{shard.id} in the pack {key}")
-        made = made.model_copy(update={"key": names.shard_file_key(shard.stage, shard.id)})
+        record = parse_record(ShardManifest, manifest, f"{shard.id} in the pack {key}")
+        record = record.model_copy(update={"key": names.shard_file_key(shard.stage, shard.id)})
         if file is not None:
-            publish_shard(store, made, file)
+            publish_shard(store, record, file)
         else:
-            put_record(store, names.shard_manifest_key(shard.stage, shard.id), made)
+            put_record(store, names.shard_manifest_key(shard.stage, shard.id), record)
         yield load_manifest(store, shard.stage, shard.id)
     if whole:
         store.delete(key)

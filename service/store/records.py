@@ -1,7 +1,7 @@
 """JSON records in the store: jobs, attempts, datasets, tags, marks, deletions, studies.
 
-The key of a study's record is `{kind}/{created}.json`. Kinds: `charts` of `graspd chart`, `scene_charts/{scene}` of the
-same command with a scene, `stability` of `graspd stability`.
+The key of a study is `{kind}/{created}.json`, with kind `charts` or `scene_charts/{scene}` for `graspd chart`, and
+`stability` for `graspd stability`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from graspd.service.store.store import Store
 
 RecordT = TypeVar("RecordT", bound=BaseModel)
 EventT = TypeVar("EventT", JobEvent, DatasetEvent)
-#: Function that writes a record under an absent key; returns whether it wrote.
+#: Function that writes a record, unless the key exists; returns whether it wrote the record.
 Put = Callable[[str, BaseModel], bool]
 
 
@@ -73,7 +73,7 @@ def _records(model: type[RecordT], store: Store, prefix: str) -> list[RecordT]:
 
 
 def _append_event(make: Callable[..., EventT], store: Store, folder: str, put: Put | None) -> EventT:
-    """Write an event under the next free number, which another process may take at the same time."""
+    """Write an event under the next free number; try again if another process takes the number first."""
     while True:
         number = max((int(key.rpartition("/")[2].partition("-")[0]) for key in _keys(store, folder)), default=0) + 1
         event = make(number=number, at=timestamp())
@@ -123,10 +123,10 @@ def load_snapshot(store: Store, dataset: str, digest: str) -> Snapshot:
 def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Snapshot:
     if digest is not None:
         return load_snapshot(store, dataset, digest)
-    taken = _records(Snapshot, store, names.dataset_snapshots_folder(dataset))
-    if not taken:
+    snapshots = _records(Snapshot, store, names.dataset_snapshots_folder(dataset))
+    if not snapshots:
         raise NotFoundError(f"dataset {dataset!r} has no snapshot; `graspd datasets snapshot {dataset}` takes one")
-    return max(taken, key=lambda one: (one.created, one.digest))
+    return max(snapshots, key=lambda snapshot: (snapshot.created, snapshot.digest))
 
 
 def newest_version(store: Store, tag: str) -> Tag | None:
@@ -135,13 +135,13 @@ def newest_version(store: Store, tag: str) -> Tag | None:
 
 
 def put_version(put: Put, tag: Tag) -> None:
-    """Write a tag after a change; ConflictError if another change was written first."""
+    """Write the next version of a tag; ConflictError if another change was written first."""
     if not put(names.tag_version_key(tag.id, tag.number), tag):
         raise ConflictError(f"the tag {tag.name!r} was changed a moment ago; try again")
 
 
 def drop_older_versions(store: Store, tag: Tag) -> None:
-    """Remove outdated versions of a tag; finally also the last version of a deleted tag."""
+    """Remove outdated versions of a tag; for a deleted tag then also the last version."""
     last = names.tag_version_key(tag.id, tag.number)
     for key in _keys(store, names.tag_versions_folder(tag.id)):
         if key < last or (key == last and tag.gone):
@@ -153,9 +153,8 @@ def newest_mark(store: Store) -> str:
 
 
 def next_mark(mark: str) -> str:
-    """Return a new mark that sorts after another and is unique among stores and indexes."""
-    number = int(mark.partition("-")[0] or 0) + 1
-    return f"{number:012}-{secrets.token_hex(4)}"
+    """Return a new unique mark that sorts after `mark`."""
+    return f"{int(mark.partition('-')[0] or 0) + 1:012}-{secrets.token_hex(4)}"
 
 
 def set_mark(store: Store, mark: str) -> None:
@@ -176,8 +175,8 @@ def scene_chart_kind(place: SceneSpec) -> str:
         return CHARTS
     if place.kind != "file":
         return f"{IN_SCENES}/{place.kind}"
-    told = place.model_dump(mode="json", include={"supports", "target"})
-    return f"{IN_SCENES}/file-{digest_json(told)[:12]}"
+    content = place.model_dump(mode="json", include={"supports", "target"})
+    return f"{IN_SCENES}/file-{digest_json(content)[:12]}"
 
 
 def chart_kind(chart: Mapping[str, Any]) -> str:
@@ -189,7 +188,7 @@ def scene_kinds(store: Store) -> list[str]:
 
 
 def publish_record(store: Store, kind: str, record: Mapping[str, Any]) -> str:
-    """Store a record of a kind; return its key, made from `created`, with a number if that key is taken."""
+    """Store a record of a kind; return its key, with a number if another record has the same time."""
     stem = f"{kind}/{re.sub(r'[^0-9A-Za-z]', '', str(record['created']))}"
     keys = (f"{stem}{number:03}.json" if number else f"{stem}.json" for number in itertools.count())
     data = json.dumps(record, allow_nan=False).encode()
@@ -197,7 +196,7 @@ def publish_record(store: Store, kind: str, record: Mapping[str, Any]) -> str:
 
 
 def latest_record(store: Store, kind: str) -> dict[str, Any] | None:
-    """Load the record of a kind that was published last, with present names; None if there is none."""
+    """Load the newest record of a kind, with present names; None if there is none."""
     key = latest_key(store, kind)
     return convert_chart(get_document(store, key)) if key else None
 
@@ -211,7 +210,7 @@ What = Literal["hand", "object", "network", "job", "dataset", "tag"]
 
 
 class Deletion(Record):
-    """Deleted resource, with the facts that its removal needs after its own record is gone."""
+    """Deleted resource, with the data for its removal after the removal of its own record."""
 
     version: Literal[1] = 1
     what: What
@@ -226,7 +225,7 @@ class Deletion(Record):
 
 
 class DeletedJob(Record):
-    """Deleted job. After the grace time its shards are removed, unless another job needs them."""
+    """Deleted job. Its shards are removed after the grace time, unless another job needs them."""
 
     version: Literal[1] = 1
     at: str
@@ -244,7 +243,7 @@ def refuse_pending_deletion(store: Store, what: str, name: str) -> None:
 
 
 def removed_folder(deletion: Deletion) -> str:
-    """Return the folder that holds a deleted resource's stored objects for the grace time."""
+    """Return the folder of the objects of a deleted resource until the end of the grace time."""
     return f"{names.REMOVED}/{_DIGITS.sub('', deletion.at)}-{deletion.what}-{deletion.id}"
 
 
@@ -254,9 +253,9 @@ def removed_before(key: str, at: str) -> bool:
 
 
 def deletions(store: Store, what: str = "") -> list[Deletion]:
-    """Return the deletions that can be undone, newest first; `what` selects one kind of resource."""
+    """Return the deletions that can be undone, newest first, of one kind of resource or of all."""
     found: dict[str, Deletion] = {}
-    # The controller writes a deletion to the second folder before it removes it from the first.
+    # The controller copies a deletion to the second folder, and then removes it from the first folder.
     for folder, before_kind in ((names.DELETIONS, "/"), (names.REMOVED, "-")):
         for key in _keys(store, folder):
             if key.count("/") == 2 and (not what or key.split(before_kind)[1] == what):
@@ -267,5 +266,5 @@ def deletions(store: Store, what: str = "") -> list[Deletion]:
 
 
 def released_key(deletion: Deletion) -> str:
-    """Return the key of a `DeletedJob`, whose shards are still to be removed."""
+    """Return the key of the `DeletedJob` of a deletion."""
     return f"{names.RELEASED}/{_DIGITS.sub('', deletion.at)}-{deletion.id}.json"

@@ -1,4 +1,4 @@
-"""Reading and writing of shards as HDF5 files, whole or a selection of grasps; schema in `columns`."""
+"""Reading and writing of shards as HDF5 files; `columns` has the schema."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from graspd.service.store.columns import SCHEMAS, Attribute, ShardKind, check_at
 from graspd.service.store.integrity import check_file
 
 Arrays = Mapping[str, NDArray[np.generic]]
-#: Attribute of each dataset: SHA-256 of its values, which reveals damage also outside the store.
+#: Attribute of each dataset with the SHA-256 of its values, to detect damage outside the store.
 _DIGEST: Final = "sha256"
 #: Maximum number of datasets and groups in a file; a shard has about fifty.
 _MOST_ITEMS: Final = 1000
-#: Largest expansion factor of deflate; size that a dataset may claim without stored data [bytes].
+#: Limit of a dataset: largest expansion factor of deflate, plus a size without stored data [bytes].
 _MOST_DEFLATED: Final = 1032
 _FREE_BYTES: Final = 1 << 16
-#: Limit of a file's unpacked size: this constant [bytes] plus a multiple of the file's size. Masks compress by a factor
-#: of a thousand, but no shard consists of masks alone.
+#: Limit of a file's unpacked size: a constant [bytes] plus a multiple of the stored size. Masks compress by a factor of
+#: a thousand, but no shard consists of masks alone.
 _FREE_IN_ALL: Final = 1 << 28
 _MOST_IN_ALL: Final = 64
 _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, MemoryError)
@@ -42,28 +42,31 @@ _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, Ov
 def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attribute]) -> bytes:
     """Return the HDF5 bytes of a shard; InputError if a column or attribute does not fit the schema.
 
-    `created` and `code_version` replace the current values; `joint_names` is also an attribute of the joint datasets.
+    Given `created` and `code_version` replace the current values. Joint datasets also have the attribute `joint_names`.
     """
     check_columns(kind, arrays)
     check_attributes(kind, attributes)
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="v110") as file:
-        # Write each attribute only once: HDF5 files still contain overwritten text.
-        said = {"schema": schema_of(kind), "code_version": PACKAGE_VERSION, "created": timestamp(), **attributes}
-        for name, value in said.items():
+        # Each attribute is written only once, because HDF5 files keep overwritten text.
+        own = {"schema": schema_of(kind), "code_version": PACKAGE_VERSION, "created": timestamp()}
+        for name, value in {**own, **attributes}.items():
             file.attrs[name] = value
         for path, array in arrays.items():
             column = SCHEMAS[kind][path]
             data = np.ascontiguousarray(array, dtype=column.dtype)
-            # Pictures compress well; float depth only after byte shuffling.
             options: dict[str, Any] = {}
             if data.ndim >= 3 and data.nbytes > 65536:
-                # One chunk per row (picture), so that readers unpack only the rows they need.
-                options.update(compression="gzip", compression_opts=1, shuffle=True, chunks=(1, *data.shape[1:]))
+                # One chunk per picture, so that readers unpack single pictures; shuffled bytes compress better.
+                options = {
+                    "compression": "gzip",
+                    "compression_opts": 1,
+                    "shuffle": True,
+                    "chunks": (1, *data.shape[1:]),
+                }
             dataset = file.create_dataset(path, data=data, track_times=False, **options)
-            dataset.attrs["units"] = column.units
-            dataset.attrs["frame"] = column.frame
-            dataset.attrs["description"] = column.description
+            for name in ("units", "frame", "description"):
+                dataset.attrs[name] = getattr(column, name)
             dataset.attrs[_DIGEST] = _digest(data)
             if path.endswith("joint_positions") and "joint_names" in attributes:
                 dataset.attrs["joint_names"] = attributes["joint_names"]
@@ -71,6 +74,7 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
 
 
 def check_columns(kind: ShardKind, arrays: Arrays) -> dict[str, int]:
+    """Return the length of each axis; InputError if names or shapes do not fit the schema."""
     schema = SCHEMAS[kind]
     if unknown := set(arrays) - set(schema):
         raise InputError(f"a {kind} shard has no dataset {sorted(unknown)[0]!r}")
@@ -102,7 +106,7 @@ class Shard:
 def read_shard(
     source: bytes | Path, *, kind: ShardKind | None = None, without: tuple[str, ...] = (), name: str = ""
 ) -> Shard:
-    """Read a shard except datasets `without`; InputError for another kind, DamagedShard for damage."""
+    """Read a shard, but not the datasets `without`; InputError for another kind, DamagedShard for damage."""
     name = name or ("shard" if isinstance(source, bytes) else str(source))
     with open_shard(source, name=name) as file:
         found = kind_of(file, name)
@@ -114,7 +118,7 @@ def read_shard(
 
 
 class ShardH5(h5py.File):  # type: ignore[misc]
-    """HDF5 file of a shard; columns and attributes of graspd 0.2 appear under their present names."""
+    """HDF5 file of a shard. Columns and attributes of graspd 0.2 have their present names."""
 
     def __contains__(self, path: object) -> bool:
         return super().__contains__(path) or (path in COLUMNS and super().__contains__(COLUMNS[str(path)]))
@@ -129,7 +133,7 @@ class ShardH5(h5py.File):  # type: ignore[misc]
 
 @contextmanager
 def open_shard(source: bytes | Path, *, name: str = "") -> Iterator[h5py.File]:
-    """Open a shard for partial reading; DamagedShard, also later, for damaged content or a wrong checksum."""
+    """Open a shard for partial reads; DamagedShard, also in the `with` block, for damage."""
     name = name or (str(source) if isinstance(source, Path) else "shard")
     if isinstance(source, Path) and source.is_file():
         check_file(source)
@@ -148,7 +152,7 @@ def open_shard(source: bytes | Path, *, name: str = "") -> Iterator[h5py.File]:
 
 
 def _check_contents(file: h5py.File, name: str) -> None:
-    """Raise InputError if a file has external data or claims more than it can hold: HDF5 follows any link."""
+    """Raise InputError for links and external data, which HDF5 would follow, and for impossible sizes."""
     claimed = held = 0
     seen, waiting = {h5py.h5o.get_info(file["/"].id).addr}, [(file, "")]
     while waiting:
@@ -157,11 +161,10 @@ def _check_contents(file: h5py.File, name: str) -> None:
             path = f"{place}{key}"
             if len(seen) > _MOST_ITEMS:
                 raise InputError(f"{name} holds more than {_MOST_ITEMS} datasets and groups, too many for a shard")
-            if not isinstance(group.get(key, getlink=True), h5py.HardLink):
+            is_hard = isinstance(group.get(key, getlink=True), h5py.HardLink)
+            if not is_hard or (address := h5py.h5o.get_info(group[key].id).addr) in seen:
                 raise InputError(f"{name}: {path} is a link; a shard contains no links")
             item = group[key]
-            if (address := h5py.h5o.get_info(item.id).addr) in seen:
-                raise InputError(f"{name}: {path} is a link; a shard contains no links")
             seen.add(address)
             if isinstance(item, h5py.Group):
                 waiting.append((item, f"{path}/"))
@@ -173,9 +176,7 @@ def _check_contents(file: h5py.File, name: str) -> None:
                 if item.nbytes > _MOST_DEFLATED * size + _FREE_BYTES:
                     raise InputError(f"{name}: {path} claims {item.nbytes} bytes, which the file cannot contain")
     if claimed > _MOST_IN_ALL * held + _FREE_IN_ALL:
-        raise InputError(
-            f"{name} claims {claimed} bytes, {claimed // held} times what it contains, too much for a shard"
-        )
+        raise InputError(f"{name} claims {claimed} bytes, {claimed // held} times its content, too much for a shard")
 
 
 def kind_of(file: h5py.File, name: str) -> ShardKind:
@@ -200,7 +201,7 @@ def _digest(data: NDArray[Any]) -> str:
 
 def _attribute(value: object) -> Attribute:
     if isinstance(value, np.ndarray):
-        return [str(v) for v in value]
+        return [*map(str, value)]
     if isinstance(value, np.generic):
         return value.item()
     return value if isinstance(value, int | float) else str(value)
@@ -216,10 +217,8 @@ def carried_attributes(shard: Shard) -> dict[str, Attribute]:
 
 def part_of_shard(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
     """Return the bytes of a base shard with the rows in a mask (N,); values and scenes are unchanged."""
-    schema = SCHEMAS["base"]
-    arrays = {
-        path: array[mask] if schema[path].shape.split()[0] == "N" else array for path, array in shard.arrays.items()
-    }
+    axes = {path: column.shape.split()[0] for path, column in SCHEMAS["base"].items()}
+    arrays = {path: array[mask] if axes[path] == "N" else array for path, array in shard.arrays.items()}
     attributes = carried_attributes(shard)
     if "shard_id" in attributes:
         attributes["shard_id"] = digest_json([attributes["shard_id"], np.flatnonzero(mask).tolist()])
@@ -228,9 +227,9 @@ def part_of_shard(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
 
 def relative_path_of(shard: Shard, taken: Collection[PurePosixPath]) -> PurePosixPath:
     """Return `HAND/OBJECT/base-BATCH.h5`, numbered if taken: two jobs may have equal batch numbers."""
-    said = shard.attributes
-    names = [str(said.get(name, "")).replace("/", "-").strip(".") or "unnamed" for name in ("hand", "object")]
-    path = PurePosixPath(*names) / f"base-{int(said.get('batch', 0)):05}.h5"  # type: ignore[arg-type]
+    given = shard.attributes
+    names = [str(given.get(name, "")).replace("/", "-").strip(".") or "unnamed" for name in ("hand", "object")]
+    path = PurePosixPath(*names) / f"base-{int(given.get('batch', 0)):05}.h5"  # type: ignore[arg-type]
     found, number = path, 1
     while found in taken:
         found, number = path.with_stem(f"{path.stem}-{number}"), number + 1

@@ -1,7 +1,6 @@
 """Object store: create-only writes of immutable objects; folder, S3, Google Cloud, Azure or memory.
 
-The operations are put if absent, get, range, list and delete. Nothing is overwritten, and no compare-and-swap is
-needed.
+Operations are put if absent, get, range, list, move and delete; compare-and-swap is not needed.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from graspd.service.model.errors import InputError, NotFoundError, StoreUnavaila
 _KEY: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*(/[A-Za-z0-9][A-Za-z0-9._=-]*)*")
 _PROBE: Final = "health/probe"
 STREAM_BYTES: Final = 1 << 20
-#: Time-outs and retries of requests; after them the task's own back-off applies.
+#: Timeouts and retries of requests to remote stores.
 _REMOTE: Final[dict[str, Any]] = {
     "client_options": {"timeout": timedelta(seconds=120), "connect_timeout": timedelta(seconds=5)},
     "retry_config": {"max_retries": 3, "retry_timeout": timedelta(seconds=30)},
@@ -44,7 +43,7 @@ class Entry:
     size: int
 
 
-#: Size, modification time and tag (if any) of a stored object; constant while it does not change.
+#: Size, modification time and tag ("" if none) of a stored object; a change of the object changes the stamp.
 Stamp = tuple[int, str, str]
 
 
@@ -52,18 +51,18 @@ class Store:
     """Objects by key. Every method raises StoreUnavailable if the store does not answer."""
 
     def __init__(self, backend: Any, url: str, *, signer: Any = None) -> None:
-        """`signer` is the same store at its address for clients; None if clients have no access."""
+        """`signer` is the backend with its address for clients; None if clients have no access."""
         self._backend = backend
         self._signer = signer
         self.url = url
         self._root = Path(backend.prefix) if isinstance(backend, LocalStore) and backend.prefix is not None else None
 
     def put(self, key: str, data: bytes) -> bool:
-        """Write an object atomically; False if the key exists (with the same bytes if content-addressed)."""
+        """Write an object atomically; return False, without a change, if the key exists."""
         return self.put_file(key, io.BytesIO(data))
 
     def put_file(self, key: str, file: IO[bytes]) -> bool:
-        """Write an object from an open file; a local store copies it in pieces."""
+        """Write an open file like `put`; a local store copies the file in pieces."""
         check_key(key)
         file.seek(0)
         with _convert_errors(key, self.url):
@@ -88,7 +87,7 @@ class Store:
             return bytes(obstore.get_range(self._backend, check_key(key), start=start, length=length))
 
     def stream(self, key: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
-        """Yield chunks of an object from `start` on; at most one chunk is in memory."""
+        """Yield chunks of an object from byte `start` on; at most one chunk is in memory."""
         end = self.size(key) if length is None else start + length
         while start < end:
             if not (chunk := self.get_range(key, start, min(STREAM_BYTES, end - start))):
@@ -108,7 +107,7 @@ class Store:
             obstore.rename(self._backend, check_key(key), check_key(to), overwrite=True)
 
     def stamp(self, key: str) -> Stamp:
-        """Return a stamp that changes when an object is replaced; NotFoundError if there is none."""
+        """Return the stamp of an object; NotFoundError if the object does not exist."""
         with _convert_errors(key, self.url):
             meta = obstore.head(self._backend, check_key(key))
             return int(meta["size"]), meta["last_modified"].isoformat(), str(meta.get("e_tag") or "")
@@ -121,7 +120,7 @@ class Store:
         return True
 
     def list(self, prefix: str, *, offset: str | None = None) -> Iterator[Entry]:
-        """Yield objects below a folder in arbitrary order; with `offset` only those whose key sorts after it."""
+        """Yield objects below a folder in arbitrary order; with `offset`, only keys that sort after it."""
         with _convert_errors(prefix, self.url):
             for batch in obstore.list(self._backend, check_key(prefix), offset=offset):
                 yield from (Entry(str(meta["path"]), int(meta["size"])) for meta in batch)
@@ -134,7 +133,7 @@ class Store:
         try:
             return str(obstore.sign(self._signer, "GET", key, timedelta(seconds=seconds)))
         except (BaseError, ValueError, TypeError, NotImplementedError, OSError):
-            # Credentials that can read but not sign: the API serves the file instead.
+            # The credentials can read but not sign; the API serves the file instead.
             return None
 
     def probe(self) -> float:
@@ -151,9 +150,11 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
     Remote stores take credentials and endpoints from the usual variables (AWS_ACCESS_KEY_ID, ...).
 
     Args:
-        public_endpoint: S3 endpoint for clients. Without it, AWS_ENDPOINT_URL is taken as internal to the service's
-            network: downloads are not signed, and the API serves files.
-        make: create a missing folder. Readers do not: an empty folder would hide a mistyped path.
+        public_endpoint: S3 endpoint for clients. Without it, AWS_ENDPOINT_URL counts as internal to the network of the
+            service: the API serves files, because downloads are not signed.
+        make: create a missing folder. Readers do not, because an empty folder would hide a mistyped path.
+
+    Raises InputError for an unknown scheme, NotFoundError for a missing folder, StoreUnavailable.
     """
     parts = urlsplit(url)
     if parts.scheme == "memory":
@@ -168,25 +169,21 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
         own = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or None
         endpoint = own if parts.scheme == "s3" else None
         backend: Any = from_url(url, **_remote_options(endpoint))
-        signer: Any
+        signer: Any = None if endpoint else backend
         if public_endpoint and parts.scheme == "s3":
             signer = from_url(url, **_remote_options(public_endpoint), endpoint=public_endpoint)
-        else:
-            signer = None if endpoint else backend
         return Store(backend, url, signer=signer)
 
 
 def local_folder(url: str) -> Path | None:
-    """Return a local store's folder, None for others; InputError for a relative path or bad characters."""
+    """Return the folder of a local store, else None; InputError for a relative path or bad characters."""
     parts = urlsplit(url)
     if parts.scheme != "file":
         return None
     if parts.netloc or not parts.path.startswith("/"):
         raise InputError(f"the store URL {url!r} must contain an absolute path: file:///absolute/folder")
     if "?" in url or "#" in url or not url.isprintable():
-        raise InputError(
-            f"the store URL {url!r} has a character that ends a path; write %3F for ?, %23 for #, %0A for a line break"
-        )
+        raise InputError(f"the store URL {url!r} has a special character; write %3F for ?, %23 for #, %0A for newline")
     return Path(unquote(parts.path))
 
 
@@ -214,13 +211,13 @@ def _open_local(folder: Path, url: str) -> Store:
 
 
 def _put_local(root: Path, key: str, data: IO[bytes]) -> bool:
-    """Write, flush to disk, then link to the final name: atomic even at a power failure."""
+    """Write a file, flush it to disk, then link it to its name: atomic even at a power failure."""
     path = root / key
     if path.exists():
         return False
     made = [folder for folder in path.parents if root in folder.parents and not folder.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
-    # obstore's listing skips names that end in `#` and digits, its own unfinished writes.
+    # obstore does not list names that end in `#` and digits, which its own unfinished writes have.
     staged = path.with_name(f"{path.name}#{random.SystemRandom().randrange(10**12)}")
     try:
         with staged.open("wb") as file:

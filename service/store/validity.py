@@ -1,7 +1,7 @@
 """Status of the grasps of a base shard: valid, feasible without validation, or neither.
 
-*Feasible*: within the geometric limits. *Valid*: feasible and held by a validator. A shard without validation has no
-valid grasps, although graspd 0.1 marked feasible grasps in its column `quality/valid`.
+*Feasible*: within the geometric limits. *Valid*: feasible, and held in validation. A shard without validation has no
+valid grasps, even if its column `quality/valid` marks feasible grasps (graspd 0.1).
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ def valid_mask(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
 
 
 def feasible_mask(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """Return the mask (N,) of grasps known to be within the geometric limits, such as valid grasps."""
+    """Return the mask (N,) of feasible grasps; without column `quality/feasible`, by `quality/valid`."""
     return np.asarray(columns.get("quality/feasible", columns["quality/valid"])) == 1
 
 
 def selection_mask(columns: Mapping[str, NDArray[Any]], *, unvalidated: bool = False) -> NDArray[np.bool_]:
-    """Return the mask (N,) of valid grasps; with `unvalidated` of feasible grasps without validation."""
+    """Return the mask (N,) of valid grasps, or of `unvalidated` feasible grasps."""
     return feasible_mask(columns) & ~validated_mask(columns) if unvalidated else valid_mask(columns)

@@ -23,7 +23,7 @@ from graspd.studies.cards.plots import draw
 from graspd.studies.cards.tally import tally_of
 from graspd.worker.rendering import sheets
 
-#: Sample pictures of the dataset.
+#: File of sample pictures, and their largest number.
 SHEET: Final = "samples.jpg"
 MOST: Final = 12
 _COLUMNS: Final = 4
@@ -33,23 +33,17 @@ _QUALITY: Final = 85
 
 
 def write_card(
-    contents: Contents,
-    folder: Path,
-    *,
-    licence: str = "",
-    source: str = "",
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    contents: Contents, folder: Path, *, licence: str = "", source: str = "", progress: Callable[[int, int], None]
 ) -> dict[str, Any]:
-    """Read all shards and write the card; replace the files of an earlier card.
-    `progress` is called after each shard with the number of shards read and of all shards. Return the figures, as in
-    `card.json`, and under `plots` the names of the pictures. Raises InputError: the folder cannot be created, the
-    dataset has no grasp, or a checksum differs; StoreUnavailable: the store does not answer."""
+    """Read all shards and write the card over an earlier one; return the content of `card.json`.
+    `progress` is called after each shard with the numbers of shards read and of all shards. Raises InputError: the
+    folder cannot be created, or the dataset is empty or damaged; StoreUnavailable: the store does not answer."""
     if not contents.shards.of("base"):
         raise InputError(f"{contents.name} has no base shard, so its card would be empty")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"the folder {folder} cannot be made: {error.strerror}") from None
+        raise InputError(f"the folder {folder} cannot be created: {error.strerror}") from None
 
     def counted() -> Iterator[ShardContents]:
         for number, piece in enumerate(read_shards(contents), start=1):
@@ -69,7 +63,7 @@ def write_card(
 
 
 def checksums(contents: Contents) -> Iterator[str]:
-    """Yield lines for `sha256sum -c`, which runs in the folder of an export or of the shards."""
+    """Yield lines for `sha256sum -c` in the folder of the export or of the shards."""
     if contents.snapshot is not None:
         yield from (f"{shard.sha256}  {path_of(shard)}\n" for shard in contents.snapshot.shards)
         return
@@ -81,7 +75,7 @@ def checksums(contents: Contents) -> Iterator[str]:
 
 
 def write_samples(shards: Shards, file: Path) -> bool:
-    """Write a JPEG of sample pictures from whole shards; return False for a dataset without pictures."""
+    """Write a JPEG of sample pictures; return False for a dataset without pictures."""
     chosen = choose_shards(shards.of("views"))
     if not chosen:
         return False
@@ -101,7 +95,7 @@ def write_samples(shards: Shards, file: Path) -> bool:
 
 
 def choose_shards(files: tuple[ShardFile, ...]) -> list[ShardFile]:
-    """Choose at most `MOST` shards, spread over the objects, with hands in rotation."""
+    """Choose at most `MOST` shards, spread over the objects, with hands in turn."""
     cells: dict[tuple[str, str], list[ShardFile]] = {}
     for file in files:
         cells.setdefault((file.hand, file.object), []).append(file)
@@ -110,7 +104,7 @@ def choose_shards(files: tuple[ShardFile, ...]) -> list[ShardFile]:
     ranked = sorted(cells, key=lambda cell: (hands.index(cell[0]) - objects.index(cell[1])) % len(hands))
     some = ranked[: max(MOST, len(objects))]
     spread = some if len(some) <= MOST else [some[round(k)] for k in np.linspace(0, len(some) - 1, MOST)]
-    # Take different batch numbers, since batches with equal numbers share materials and lights.
+    # Batches with equal numbers share materials and lights, so different numbers are taken.
     chosen = (cells[cell] for cell in sorted(spread, key=lambda cell: objects.index(cell[1])))
     return [batches[number % len(batches)] for number, batches in enumerate(chosen)]
 

@@ -1,4 +1,4 @@
-"""Contents of a card: a snapshot or folder of shards; shards are read one by one, without pictures."""
+"""Input of a card: the shards of a snapshot or folder, read one by one without pictures."""
 
 from __future__ import annotations
 
@@ -44,13 +44,12 @@ class AssetFacts:
     licence: str = ""
     source: str = ""
     description: str = ""
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    """Measurements from its ingest check, SI units."""
+    facts: Mapping[str, Any] = field(default_factory=dict)  # measurements from its ingest check, SI units
 
 
 @dataclass(frozen=True)
 class Contents:
-    """Input of a card; a folder of shards has no `record`, and has a `snapshot` only if it is an export."""
+    """Input of a card; a folder of shards has no `record`, and a `snapshot` only if it is an export."""
 
     name: str
     shards: Shards
@@ -60,8 +59,7 @@ class Contents:
     record: DatasetRecord | None = None
     gaps: Mapping[Pair, tuple[int, str]] = field(default_factory=dict)
     """For each cell, the number of batches missing in the snapshot, and the reason."""
-    root: Path | None = None
-    """Folder of the shards; None for shards in a store."""
+    root: Path | None = None  # folder of the shards; None for shards in a store
 
 
 def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, cache: Path | None = None) -> Contents:
@@ -82,8 +80,7 @@ def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, c
 
 def contents_of_folder(folder: Path) -> Contents:
     """Return the shards of a folder, such as an export; only built-in hands and objects have facts.
-    Raises NotFoundError: the folder contains no shard. InputError: a file is not a shard, or `snapshot.json` is
-    damaged."""
+    Raises NotFoundError: the folder contains no shard; InputError: a file is no shard or damaged."""
     shards = open_shards(folder)
     listed = folder / "snapshot.json"
     taken = parse_record(Snapshot, listed.read_bytes(), str(listed)) if listed.is_file() else None
@@ -96,10 +93,9 @@ def contents_of_folder(folder: Path) -> Contents:
 
 
 def with_provenance(contents: Contents, file: Path) -> Contents:
-    """Add missing licences and sources of hands and objects from a JSON file.
+    """Add licences, sources and descriptions of hands and objects from a JSON file.
     Its form is `{"hands": {"shadow": {"licence": "...", "source": "..."}}, "objects": {"*": {...}, "mug": {...}}}`,
-    where `*` stands for all other assets. Raises InputError: the JSON is invalid, or names assets that the dataset
-    lacks."""
+    where `*` stands for all other assets. Raises InputError: the JSON is invalid or names unknown assets."""
     try:
         said = from_json(file.read_bytes())
         groups = {kind: {str(k): dict(v) for k, v in said.get(kind, {}).items()} for kind in ("hands", "objects")}
@@ -182,10 +178,8 @@ def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, tu
     there = {shard.id for shard in taken.shards}
     gaps = {}
     for cell in record.cells():
-        missing = [
-            task for task in plan_tasks(job_of(cell, record.options, record.revisions)) if task.output not in there
-        ]
-        if missing:
+        tasks = plan_tasks(job_of(cell, record.options, record.revisions))
+        if missing := [task for task in tasks if task.output not in there]:
             reasons = (attempts[-1].reason for task in missing if (attempts := task_attempts(store, task.id)))
             gaps[cell.hand.name, cell.object.name] = len(missing), next(reasons, "not made yet, or cancelled")
     return gaps
@@ -212,22 +206,21 @@ _THREADS: Final = 8
 
 @dataclass(frozen=True)
 class ShardContents:
-    """One shard: its columns, and metadata of its attributes and manifest."""
+    """A shard's columns, attributes, and metadata of its manifest."""
 
     file: ShardFile
     columns: Mapping[str, NDArray[Any]]
     said: Mapping[str, Any]
     """Root attributes; for a shard that is not opened, the manifest's fields of the same names."""
     size_bytes: int
-    rows: int
-    """Number of grasps, of pairs of grasp and scene, or of pictures."""
+    rows: int  # number of grasps, of pairs of grasp and scene, or of pictures
     info: Mapping[str, Any] = field(default_factory=dict)
     """Info of the stage: seconds of its parts, rejected candidates."""
     revision: int | None = None
 
 
 def read_shards(contents: Contents) -> Iterator[ShardContents]:
-    """Yield every shard in the order of `Shards`; prefetch a few of the next ones."""
+    """Yield all shards in the order of `Shards`; read some ahead."""
     sizes = {shard.id: shard.size_bytes for shard in contents.snapshot.shards} if contents.snapshot else {}
     with ThreadPoolExecutor(_THREADS, thread_name_prefix="card") as pool:
         files = iter(contents.shards)

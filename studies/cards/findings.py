@@ -1,4 +1,4 @@
-"""Anomalies in a dataset's figures: biases, gaps and failures that matter for training."""
+"""Findings in a dataset's figures: biases, gaps and failures that matter for training."""
 
 from __future__ import annotations
 
@@ -10,16 +10,11 @@ import numpy as np
 
 Row = Mapping[str, Any]
 
-#: Share of the median yield of a hand's cells, below which a cell's yield is low.
-_LITTLE: Final = 0.5
-#: A joint hardly moves if 98 of 100 grasps use less than this share of its range.
-_STILL: Final = 0.05
-#: Share of grasps with a joint at its limit, above which the joint is reported.
-_AT_LIMIT: Final = 0.5
-#: Share of an object's directions without grasps, above which they are reported.
-_EMPTY: Final = 0.25
-#: Ratio of valid grasps between hands or objects, above which it is reported.
-_UNEVEN: Final = 1.2
+_LITTLE: Final = 0.5  # share of the median yield of a hand's cells, below which a cell's yield is low
+_STILL: Final = 0.05  # a joint hardly moves if 98 of 100 grasps use less than this share of its range
+_AT_LIMIT: Final = 0.5  # share of grasps with a joint at its limit, above which the joint is reported
+_EMPTY: Final = 0.25  # share of an object's directions without grasps, above which they are reported
+_UNEVEN: Final = 1.2  # ratio of valid grasps between hands or objects, above which it is reported
 #: A direction is preferred above this multiple of its share under uniform directions.
 _PEAKED: Final = 1.25
 _SHOWN: Final = 8
@@ -35,7 +30,7 @@ _UNMIXED: Final = {
 
 
 def findings(card: Row) -> list[str]:
-    """Return sentences in Markdown, each with its figures."""
+    """Return the findings of a card's content as sentences in Markdown, with figures."""
     parts = (_gaps, _yields, _balance, _rechecks, _table, _directions, _joints, _qualities, _mixed, _unknown)
     return [line for part in parts for line in part(card)]
 
@@ -125,7 +120,7 @@ def _table(card: Row) -> Iterator[str]:
 
 
 def _elevations(card: Row) -> Iterator[str]:
-    """Compare the palm's elevation over the table with directions drawn uniformly on the sphere."""
+    """Compare elevations of palms over the table with directions drawn uniformly on the sphere."""
     every, clear = (
         np.sum([sums[name] for sums in card["elevation"].values()] or [[0]], axis=0) for name in ("all", "clear")
     )

@@ -1,4 +1,4 @@
-"""Figures of a card, computed from the shards: the content of `card.json`. None means unknown."""
+"""Content of `card.json`, computed from the shards; None stands for unknown values."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def _table(cell: CellTally) -> Row:
 
 
 def _directions(cell: CellTally) -> Row | None:
-    """Return the spread of approach directions in the object frame; None if palms are unknown."""
+    """Return the spread of approach directions in the object frame; None if the hands' files are missing."""
     vectors = cell.directions()
     if not len(vectors):
         return None
@@ -193,7 +193,7 @@ def _directions(cell: CellTally) -> Row | None:
 
 
 def _types(cell: CellTally) -> Row | None:
-    """Return the number of grasps of each type, and its entropy; None if no shard has types."""
+    """Return the number of grasps of each type, and the types' entropy; None if no shard has types."""
     told = cell.column("grasp_type")
     if not len(told):
         return None
@@ -202,7 +202,7 @@ def _types(cell: CellTally) -> Row | None:
 
 
 def _cells(contents: Contents, tally: Tally) -> list[Row]:
-    """Return a row per cell (hand x object) of the matrix; if this is unknown, per cell with shards."""
+    """Return a row per cell (hand x object) of the dataset; for a folder, per cell with shards."""
     asked = contents.record.options.grasps if contents.record else None
     pairs = [(hand, obj) for hand in contents.hands for obj in contents.objects] if contents.record else [*tally.cells]
     rows = []

@@ -1,4 +1,4 @@
-"""A card as a page: `README.md` with the YAML head for dataset hubs, from the template `page.md.j2`."""
+"""A card as a page: `README.md` with a YAML head for dataset hubs, from the template `page.md.j2`."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def render_card(card: Row, plots: Mapping[str, str]) -> str:
 
 
 def yaml_head(card: Row) -> dict[str, Any]:
-    """Return the YAML head; every value is a JSON value, because JSON is valid YAML."""
+    """Return the YAML head as JSON values, which are valid YAML."""
     made = card["composition"]
     tags = ["grasping", "dexterous-manipulation", "synthetic", "graspd", *(hand["name"] for hand in made["hands"])]
     return {
@@ -190,31 +190,27 @@ def _rejected(rejected: Mapping[str, int] | None) -> str:
     return ", ".join(parts) or ("-" if rejected is not None else "not recorded")
 
 
-def _template() -> Any:
-    # The page is Markdown, so only cells of tables are escaped.
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=False,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters |= {
-        "cell": cell_text,
-        "count": _count,
-        "fixed": format_fixed,
-        "interval": lambda found: (
-            f"{percent(found['share'])} ({percent(found['low'])} to {percent(found['high'])})" if found else "unknown"
-        ),
-        "json": lambda value, indent=None: json.dumps(value, ensure_ascii=False, indent=indent),
-        "letters": lambda name: "".join(letter for letter in name if letter.isalnum()) or "dataset",
-        "millimetres": lambda extents: " x ".join(f"{1e3 * extent:.0f}" for extent in extents or ()) or "-",
-        "percent": percent,
-        "rejected": _rejected,
-        "size": _size,
-    }
-    return environment.get_template("page.md.j2")
-
-
-_TEMPLATE: Final = _template()
+# The page is Markdown, where only cells of tables need escapes.
+_ENVIRONMENT: Final = Environment(
+    loader=FileSystemLoader(Path(__file__).parent),
+    autoescape=False,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
+_ENVIRONMENT.filters |= {
+    "cell": cell_text,
+    "count": _count,
+    "fixed": format_fixed,
+    "interval": lambda found: (
+        f"{percent(found['share'])} ({percent(found['low'])} to {percent(found['high'])})" if found else "unknown"
+    ),
+    "json": lambda value, indent=None: json.dumps(value, ensure_ascii=False, indent=indent),
+    "letters": lambda name: "".join(letter for letter in name if letter.isalnum()) or "dataset",
+    "millimetres": lambda extents: " x ".join(f"{1e3 * extent:.0f}" for extent in extents or ()) or "-",
+    "percent": percent,
+    "rejected": _rejected,
+    "size": _size,
+}
+_TEMPLATE: Final = _ENVIRONMENT.get_template("page.md.j2")

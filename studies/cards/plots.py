@@ -14,10 +14,8 @@ from graspd.studies.cards.tally import Tally, cell_counts
 Row = Mapping[str, Any]
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 INK: Final = "#1f2937"
-#: Largest number of objects of a matrix that shows names and numbers.
-_NAMED: Final = 40
-#: Largest number of panels: the first hands get one each.
-_PANELS: Final = 6
+_NAMED: Final = 40  # largest number of objects of a matrix that shows names and numbers
+_PANELS: Final = 6  # largest number of panels: the first hands get one each
 #: Title, column, and whether the axis ends at the 99th percentile.
 _QUALITIES: Final = tuple(
     (metric.heading, metric.name, metric.plot == "cut") for metric in GRASP_METRICS if metric.plot != "no"
@@ -26,10 +24,7 @@ _DPI: Final = 110
 
 
 def draw(card: Row, tally: Tally, folder: Path) -> dict[str, str]:
-    """Write the plots that have data.
-
-    Returns:
-        file name -> caption, in the order of the card."""
+    """Write all plots that have data; return their captions by file name, in the order of the card."""
     plots: tuple[tuple[str, str, Callable[[Row, Tally], Any]], ...] = (
         ("yield.png", "Valid share of validated grasps, by hand and object", _yields),
         ("quality.png", "Distribution of each quality over the valid grasps, by hand", _qualities),
@@ -54,12 +49,8 @@ def _figure(width: float, height: float) -> Any:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _hands(card: Row) -> list[str]:
-    return [hand["name"] for hand in card["composition"]["hands"]]
-
-
-def _objects(card: Row) -> list[str]:
-    return [obj["name"] for obj in card["composition"]["objects"]]
+def _names(card: Row, what: str) -> list[str]:
+    return [asset["name"] for asset in card["composition"][what]]
 
 
 def _plain(axes: Any) -> None:
@@ -69,7 +60,7 @@ def _plain(axes: Any) -> None:
 
 
 def _yields(card: Row, tally: Tally) -> Any:
-    hands, objects = _hands(card), _objects(card)
+    hands, objects = _names(card, "hands"), _names(card, "objects")
     shares = np.full((len(objects), len(hands)), np.nan)
     rows = {(cell["hand"], cell["object"]): cell for cell in card["cells"] if cell["of_validated"] is not None}
     for (hand, obj), cell in rows.items():
@@ -84,11 +75,9 @@ def _yields(card: Row, tally: Tally) -> Any:
     axes.set_yticks(range(len(objects)) if named else [], objects if named else [])
     axes.set_title(f"{card['name']}: valid of validated (grasps)", loc="left", fontsize=10)
     for (hand, obj), cell in rows.items() if named else ():
-        x, y = hands.index(hand), objects.index(obj)
-        text = f"{100 * cell['of_validated']:.0f} %  ({cell['valid']})"
-        axes.text(
-            x, y, text, ha="center", va="center", fontsize=8, color="white" if cell["of_validated"] > 0.6 else INK
-        )
+        x, y, share = hands.index(hand), objects.index(obj), cell["of_validated"]
+        text, colour = f"{100 * share:.0f} %  ({cell['valid']})", "white" if share > 0.6 else INK
+        axes.text(x, y, text, ha="center", va="center", fontsize=8, color=colour)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
     figure.colorbar(image, ax=axes, label="valid share of validated grasps", shrink=0.8)
@@ -96,7 +85,7 @@ def _yields(card: Row, tally: Tally) -> Any:
 
 
 def _qualities(card: Row, tally: Tally) -> Any:
-    hands = _hands(card)
+    hands = _names(card, "hands")
     shown = [entry for entry in _QUALITIES if any(entry[1] in card["quality"][hand] for hand in hands)]
     if not shown:
         return None
@@ -124,8 +113,8 @@ def _qualities(card: Row, tally: Tally) -> Any:
 
 
 def _directions(card: Row, tally: Tally) -> Any:
-    """Plot the palms' directions: in the top row in the object's frame, in the bottom row over the table."""
-    hands = [hand for hand in _hands(card) if card["directions"]["by_hand"][hand]][:_PANELS]
+    """Plot directions of palms: in the object's frame (top row) and by elevation over the table (bottom row)."""
+    hands = [hand for hand in _names(card, "hands") if card["directions"]["by_hand"][hand]][:_PANELS]
     if not hands:
         return None
     with_table = bool(card["elevation"])
@@ -140,8 +129,7 @@ def _directions(card: Row, tally: Tally) -> Any:
         vectors = tally.of_hand(hand).directions()
         density = cell_counts(vectors, bands, sectors) * bands * sectors / len(vectors)
         mesh = axes.pcolormesh(longitudes, latitudes, density, cmap="magma", vmin=0, vmax=3, rasterized=True)
-        axes.set_xticklabels([])
-        axes.set_yticklabels([])
+        axes.set(xticklabels=[], yticklabels=[])
         axes.grid(alpha=0.2)
         axes.set_title(hand, fontsize=10)
         if with_table and hand in card["elevation"]:
@@ -158,7 +146,7 @@ def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) ->
     edges = np.linspace(-90, 90, len(sums["all"]) + 1)
     for name, colour, label in (("all", "#cbd5e1", "all pairs"), ("clear", COLOURS[0], "clear of the table")):
         axes.stairs(sums[name], edges, fill=True, color=colour, label=label)
-    # Expected counts per bin for directions drawn uniformly on the sphere:
+    # Expected counts per bin for directions drawn uniformly on the sphere.
     even = np.diff(np.sin(np.radians(edges))) / 2 * sum(sums["all"])
     axes.stairs(even, edges, color=INK, linestyle="--", linewidth=1, label="uniform directions")
     axes.set_xticks([-90, -45, 0, 45, 90], ["below", "-45°", "side", "45°", "above"], fontsize=8)
@@ -170,7 +158,7 @@ def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) ->
 
 
 def _table(card: Row, tally: Tally) -> Any:
-    hands, objects = _hands(card), _objects(card)
+    hands, objects = _names(card, "hands"), _names(card, "objects")
     rows = [cell for cell in card["cells"] if cell["clear_of_table"] is not None]
     if not rows:
         return None
@@ -192,7 +180,7 @@ def _table(card: Row, tally: Tally) -> Any:
 
 
 def _joints(card: Row, tally: Tally) -> Any:
-    hands = [hand for hand in _hands(card) if card["joints"].get(hand)][:_PANELS]
+    hands = [hand for hand in _names(card, "hands") if card["joints"].get(hand)][:_PANELS]
     if not hands:
         return None
     most = max(len(card["joints"][hand]) for hand in hands)
@@ -200,7 +188,7 @@ def _joints(card: Row, tally: Tally) -> Any:
     panels = figure.subplots(1, len(hands), squeeze=False)[0]
     for number, (axes, hand) in enumerate(zip(panels, hands, strict=True)):
         joints = card["joints"][hand]
-        colour = COLOURS[_hands(card).index(hand) % len(COLOURS)]
+        colour = COLOURS[_names(card, "hands").index(hand) % len(COLOURS)]
         for row, use in enumerate(joints.values()):
             axes.plot([0, 1], [row, row], color="#e2e8f0", linewidth=5, solid_capstyle="butt")
             axes.plot([use["p5"], use["p95"]], [row, row], color=colour, linewidth=5, solid_capstyle="butt")
@@ -224,15 +212,14 @@ def _sizes(card: Row, tally: Tally) -> Any:
     figure = _figure(9, 3.2)
     panels = figure.subplots(1, 3, sharey=True)
     for axes, place, what in zip(panels, range(3), ("smallest", "middle", "largest"), strict=True):
-        for number, hand in enumerate(_hands(card)):
+        for number, hand in enumerate(_names(card, "hands")):
             own = [cell for cell in rows if cell["hand"] == hand]
             extents = [1e3 * sizes[cell["object"]][place] for cell in own]
             shares = [100 * cell["of_validated"] for cell in own]
             axes.scatter(extents, shares, s=22, color=COLOURS[number % len(COLOURS)], label=hand, alpha=0.85)
         axes.set_xlabel(f"{what} extent of the object, mm", fontsize=9)
         axes.tick_params(labelsize=8)
-        axes.set_xlim(0, None)
-        axes.set_ylim(0, 103)
+        axes.set(xlim=(0, None), ylim=(0, 103))
         _plain(axes)
     panels[0].set_ylabel("valid share of validated grasps, %", fontsize=9)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, frameon=False)

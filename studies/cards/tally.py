@@ -20,11 +20,9 @@ from graspd.studies.cards.contents import AssetFacts, Contents, Pair, ShardConte
 from graspd.worker.grasps import Posture
 from graspd.worker.quality.diversity import cells_of
 
-#: Number of bins between a joint's limits.
-BINS: Final = 200
+BINS: Final = 200  # number of bins between a joint's limits
 
-#: A joint closer to its limit than this share of its range counts as at its limit.
-_AT: Final = 0.01
+_AT: Final = 0.01  # distance from a limit, as a share of the range, below which a joint is at its limit
 
 
 @dataclass
@@ -34,8 +32,7 @@ class JointUse:
     names: tuple[str, ...]
     lower: Floats
     upper: Floats
-    counts: NDArray[np.int64]
-    """(J, BINS) counts of grasps."""
+    counts: NDArray[np.int64]  # (J, BINS) counts of grasps
 
     @classmethod
     def of(cls, names: tuple[str, ...], facts: Mapping[str, Any]) -> JointUse:
@@ -46,7 +43,7 @@ class JointUse:
         return cls(known, low, high, np.zeros((len(known), BINS), np.int64))
 
     def add(self, names: tuple[str, ...], positions: Floats) -> None:
-        """Count positions (N, joints) of the joints `names`; positions outside the limits count at the limit."""
+        """Count positions (N, J) of the joints `names`; positions beyond a limit count as at the limit."""
         for row, name in enumerate(self.names):
             if name not in names:
                 continue
@@ -55,37 +52,25 @@ class JointUse:
             self.counts[row] += np.bincount(places, minlength=BINS)
 
     def shares(self) -> dict[str, dict[str, float]]:
-        """Return statistics of each joint as shares of its range.
-        These are the 5th, 50th and 95th percentile, and the range from the 1st to the 99th (`used`). Further statistics
-        are the shares of grasps at the lower and upper limit."""
+        """Return percentiles of each joint, the range `used` from the 1st to the 99th, and shares at its limits."""
         found = {}
         near = max(1, round(_AT * BINS))
         for name, counts in zip(self.names, self.counts, strict=True):
             if not (total := int(counts.sum())):
                 continue
             below = np.cumsum(counts) / total
-            low, p5, middle, p95, high = (
-                (np.searchsorted(below, q) + 0.5) / BINS for q in (0.01, 0.05, 0.5, 0.95, 0.99)
-            )
-            found[name] = {
-                "p5": float(p5),
-                "median": float(middle),
-                "p95": float(p95),
-                "used": float(high - low),
-                "at_lower": float(counts[:near].sum() / total),
-                "at_upper": float(counts[-near:].sum() / total),
-            }
+            low, p5, middle, p95, high = (np.searchsorted(below, (0.01, 0.05, 0.5, 0.95, 0.99)) + 0.5) / BINS
+            limits = {"at_lower": counts[:near].sum() / total, "at_upper": counts[-near:].sum() / total}
+            shares = {"p5": p5, "median": middle, "p95": p95, "used": high - low} | limits
+            found[name] = {key: float(value) for key, value in shares.items()}
         return found
 
 
 Array = NDArray[Any]
 Floats32 = NDArray[np.float32]
-#: Number of a cell's first grasps from which its diversity is computed.
-SAMPLED: Final = 512
-#: Number of arrays of a cell above which they are merged.
-_UNPACKED: Final = 16
-#: Grasps with all numbers equal to this many decimals (metres, radians) count as repeated.
-_DIGITS: Final = 6
+SAMPLED: Final = 512  # number of a cell's first grasps from which its diversity is computed
+_UNPACKED: Final = 16  # number of arrays of a cell above which they are merged
+_DIGITS: Final = 6  # grasps with all numbers equal to this many decimals (metres, radians) count as repeated
 
 
 @dataclass
@@ -96,10 +81,8 @@ class CellTally:
     """Numbers of grasps and pairs.
     `validated`: candidates in validated shards. `placed`: valid grasps placed into scenes; `clear`: clear in at least
     one scene. `lift_tested`: valid grasps with a lift test at half friction; `lift_hard`: lifted in this test."""
-    seconds: float = 0.0
-    """Worker seconds over all stages."""
-    rejected: Counter[str] = field(default_factory=Counter)
-    """Rejected candidates by reason."""
+    seconds: float = 0.0  # worker seconds over all stages
+    rejected: Counter[str] = field(default_factory=Counter)  # rejected candidates by reason
     refused: Counter[int] = field(default_factory=Counter)
     """Number of pairs of grasp and scene by code of `grasp/rejection`."""
     columns: dict[str, list[Floats32]] = field(default_factory=dict)
@@ -123,7 +106,7 @@ class CellTally:
         return out
 
     def pack(self) -> None:
-        """Merge the arrays of all shards: thousands of small arrays need ten times the memory."""
+        """Merge the arrays of many shards, because thousands of small arrays need ten times the memory."""
         every: list[list[Any]] = [*self.columns.values(), self.towards, self.prints]
         for parts in every:
             if len(parts) > _UNPACKED:
@@ -134,7 +117,7 @@ class CellTally:
         return np.concatenate(self.columns[name]) if self.columns.get(name) else np.empty(0, np.float32)
 
     def directions(self) -> Floats32:
-        """Return directions (N, 3) to the palm; empty if it is unknown."""
+        """Return unit vectors (N, 3) to the palms; empty if they are unknown."""
         return np.concatenate(self.towards) if self.towards else np.empty((0, 3), np.float32)
 
 
@@ -146,16 +129,14 @@ class Tally:
     joints: dict[str, JointUse] = field(default_factory=dict)
     elevation: dict[str, dict[str, NDArray[np.int64]]] = field(default_factory=dict)
     """Numbers of pairs of grasp and scene of each hand, all and clear ones, by the palm's elevation."""
-    seconds: dict[str, float] = field(default_factory=dict)
-    """Worker seconds of each kind of shard."""
+    seconds: dict[str, float] = field(default_factory=dict)  # worker seconds of each kind of shard
     parts: Counter[str] = field(default_factory=Counter)
     bytes: Counter[str] = field(default_factory=Counter)
     shards: Counter[str] = field(default_factory=Counter)
     values: dict[str, Counter[Any]] = field(default_factory=dict)
     """Number of shards by values of attributes such as method, device, seed."""
     revisions: dict[str, Counter[int]] = field(default_factory=dict)
-    created: list[str] = field(default_factory=list)
-    """First and last time of a shard, RFC 3339."""
+    created: list[str] = field(default_factory=list)  # first and last time of a shard, RFC 3339
     threshold_m: Counter[float] = field(default_factory=Counter)
 
     def of_hand(self, hand: str) -> CellTally:
@@ -172,7 +153,7 @@ _ATTRIBUTES: Final = (
 
 
 def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
-    """Sum all pieces; those of a batch must be in the order base, scene, views, as from `read_shards`."""
+    """Return the sums over all shards; those of a batch are in the order base, scene, views."""
     tally = Tally()
     valid: dict[str, Array] = {}
     batch_now: tuple[Pair, int] | None = None
@@ -279,16 +260,13 @@ def _add_scene(
     sums["clear"] += elevations(towards[clear])
 
 
-#: Fewest grasps for statements on empty cells. With this many uniform grasps a cell is empty with probability e^-5,
-#: which gives 0.3 empty cells of 48.
+#: Fewest grasps for statements on empty cells: with uniform directions, 0.3 of 48 cells would be empty (e^-5 each).
 ENOUGH: Final = 5 * DIRECTION_CELLS
-#: Number of bins of elevations from -90 to 90 degrees.
-ELEVATION_BINS: Final = 36
+ELEVATION_BINS: Final = 36  # number of bins of elevations from -90 to 90 degrees
 
 
 def cell_counts(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
-    """Return (bands, sectors) counts of unit vectors (N, 3) per cell.
-    Band 0 is the lowest; sector 0 begins at azimuth -180 degrees."""
+    """Return (bands, sectors) counts of unit vectors (N, 3), from the lowest band and azimuth -180 degrees on."""
     cells = cells_of(np.asarray(directions).reshape(-1, 3), bands, sectors)
     return np.bincount(cells, minlength=bands * sectors).reshape(bands, sectors)
 

@@ -1,4 +1,4 @@
-"""Run of a chart: every setting named on the command line on every pair, with interleaved repeats."""
+"""Run of a chart: all settings of the command line on all pairs, with interleaved repeats."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ from graspd.worker.validation.decomposition import decompose
 
 Say = Callable[[str], None]
 
-#: Error bound of the object's mesh for measurement and validation [m]. It is equal for all settings, so that the chart
-#: shows the effect of coarser meshes in planning.
+#: Error bound of the object's mesh for measurement and validation [m]; only meshes for planning depend on the setting.
 TRUE_ERROR_M: Final = FIDELITIES["standard"].face_error_m
 
 
@@ -49,8 +48,8 @@ def chart(
     keep: Callable[[dict[str, Any]], None],
 ) -> dict[str, Any]:
     """Run all settings on all pairs; validate each held grasp in `models` models around the nominal one.
-    `say` receives a line per cell, `keep` the partial result after each pair. Return `runs[]` (one setting on one pair
-    each), `summary[]` over hands and objects, `by_hand` over each hand's objects, `device`, `created`."""
+    `say` receives a line per cell, `keep` the partial result after each pair. Return `runs`, one setting on one pair
+    each; `summary` over all pairs; `by_hand` over each hand's objects; and settings of the chart."""
     runs: list[dict[str, Any]] = []
     for thing in things:
         for hand in hands:
@@ -90,28 +89,20 @@ def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting], models:
 
 def _row(cell: Rollout, hand: HandModel, thing: ChartObject) -> dict[str, Any]:
     setting = cell.setting
-    return {
-        "method": setting.method,
-        "fidelity": setting.fidelity,
-        "hand": hand.name,
-        "object": thing.name,
-        "options": dict(setting.options),
-        **run_figures(cell),
-        "best": {key: rounded_json_value(value) for key, value in cell.best().items()},
-    }
+    names = {"method": setting.method, "fidelity": setting.fidelity, "hand": hand.name, "object": thing.name}
+    best = {key: rounded_json_value(value) for key, value in cell.best().items()}
+    return {**names, "options": dict(setting.options), **run_figures(cell), "best": best}
 
 
 def _line(run: dict[str, Any]) -> str:
     return (
         f"{run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
         f"{run['end_to_end_per_second']:8.3f} valid/s  dexgraspbench {run['dexgraspbench']:.2f}  hard "
-        f"{run['hard']:.2f}  "
-        f"eps {run['epsilon']:.3f}  PD {run['pd_mm']:.2f} mm"
+        f"{run['hard']:.2f}  eps {run['epsilon']:.3f}  PD {run['pd_mm']:.2f} mm"
     )
 
 
-#: Label of methods without fidelities: they run with the settings of their source.
-LABEL: Final = "as published"
+LABEL: Final = "as published"  # label of methods without fidelities: they run with the settings of their source
 
 _VARIANT: Final = re.compile(r"([^:@]+)(?::([\w.]+=[\w.]+(?:\+[\w.]+=[\w.]+)*))?(?:@([1-9]\d{0,3}))?")
 
@@ -126,9 +117,9 @@ def settings_of(
     quick: bool,
     run: ExecutionContext,
 ) -> list[Setting]:
-    """Return a setting for every method, fidelity and batch; methods without fidelities have one each.
-    Without fidelities, a method gets `batches[0]` grasps per call, or `baseline_batch` if it has an option `steps`,
-    because its grasps take seconds each. Raises InputError: a method is unknown, or an option belongs to no method."""
+    """Return a setting for each fidelity and batch of each method, and one for a method without fidelities.
+    The latter has `batches[0]` grasps per call, or `baseline_batch` if it has an option `steps`, because such grasps
+    take seconds each. Raises InputError: a method or an option is unknown."""
     variants = [_variant(text) for text in methods]
     given = _options_of(options, [name for name, _, _ in variants])
     found: list[Setting] = []
@@ -147,7 +138,7 @@ def settings_of(
 
 
 def _variant(text: str) -> tuple[str, dict[str, str], int | None]:
-    """Parse `graspit:keep=20@40` into name, options and grasps per call; the last two are optional."""
+    """Parse a method such as `graspit:keep=20@40` into name, options and grasps per call."""
     found = _VARIANT.fullmatch(text)
     if found is None:
         raise InputError(f"{text!r} is no method; write NAME, NAME:OPTION=VALUE or NAME:OPTION=VALUE@GRASPS_PER_CALL")

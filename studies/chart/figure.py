@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from graspd.studies.chart.statistics import valid_rate_bound
 
 Row = Mapping[str, Any]
-#: Function from a point's row and all rows to its label.
-PointLabel = Callable[[Row, Sequence[Row]], str]
+Rows = Sequence[Row]
+PointLabel = Callable[[Row, Rows], str]  # function from a point's row and all rows to its label
+Styles = Mapping[str, tuple[str, str]]  # colour and marker of each method
 
-#: Title and key of each accuracy that is plotted over speed.
+#: Title and key of each accuracy of charts of free objects, and of charts of scenes.
 PANELS: Final = (
     ("Success under the DexGraspBench protocol", "dexgraspbench"),
     ("Success at half the friction", "hard"),
@@ -53,7 +54,7 @@ def plain_axes(axes: Any) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
+def draw(rows: Rows, files: Sequence[Path]) -> None:
     """Plot accuracies over valid grasps per second, and success over seconds to the first valid grasp."""
     figure = new_figure(15.5, 8.6)
     panels = figure.subplots(2, 3)
@@ -63,20 +64,14 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
         labels += _over_speed(axes, rows, styles, key, title, words)
     last, timed = panels.flat[5], [row for row in rows if row["seconds_to_first_valid"]]
     labels += _panel(last, timed, styles, x="seconds_to_first_valid", y="dexgraspbench")
-    last.set_xlabel("seconds to the first valid grasp, end to end (less is better)")
+    last.set(xlabel="seconds to the first valid grasp, end to end (less is better)", ylim=(-0.07, 1.04))
     last.set_title("Success under the DexGraspBench protocol", loc="left", fontsize=11)
-    last.set_ylim(-0.07, 1.04)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
     _save(figure, labels, files)
 
 
 def draw_hands(
-    by_hand: Mapping[str, Sequence[Row]],
-    file: Path,
-    *,
-    key: str,
-    words: tuple[str, str],
-    label: PointLabel | None = None,
+    by_hand: Mapping[str, Rows], file: Path, *, key: str, words: tuple[str, str], label: PointLabel | None = None
 ) -> None:
     """Plot a panel per hand, accuracy over speed; `words` has the axis labels, `label` labels a point."""
     columns = min(3, len(by_hand))
@@ -101,13 +96,7 @@ def _save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
 
 
 def _over_speed(
-    axes: Any,
-    rows: Sequence[Row],
-    styles: Mapping[str, tuple[str, str]],
-    key: str,
-    title: str,
-    words: str,
-    label: PointLabel | None = None,
+    axes: Any, rows: Rows, styles: Styles, key: str, title: str, words: str, label: PointLabel | None = None
 ) -> list[Label]:
     """Plot one accuracy over the speed, with the Pareto front; return the labels of the points."""
     known = [row for row in rows if row[key] is not None]
@@ -122,8 +111,8 @@ def _over_speed(
     return labels
 
 
-def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> None:
-    """Plot shares of candidates over lifted grasps per `second`, and lifts over seconds to the first."""
+def draw_scenes(rows: Rows, files: Sequence[Path], *, second: str) -> None:
+    """Plot shares of candidates over lifted grasps per `second` (the unit of time), and over time to the first."""
     figure = new_figure(15.5, 8.6)
     panels = figure.subplots(2, 3)
     styles = _styles(rows)
@@ -134,33 +123,24 @@ def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> N
     timed = [row for row in rows if row["seconds_to_first"]]
     last = panels.flat[4]
     labels += _panel(last, timed, styles, x="seconds_to_first", y="lift", label=fidelity_label)
-    last.set_xlabel(f"{second}s to the first that is lifted (less is better)")
+    last.set(xlabel=f"{second}s to the first that is lifted (less is better)", ylim=(-0.07, 1.07))
     last.set_title("Lifted, by settings with a lift in every pair", loc="left", fontsize=11)
-    last.set_ylim(-0.07, 1.07)
     panels.flat[5].set_visible(False)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     _save(figure, labels, files)
 
 
-def _styles(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
+def _styles(rows: Rows) -> Styles:
     methods = list(dict.fromkeys(row["method"] for row in rows))
     return {m: (COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, m in enumerate(methods)}
 
 
-def _panel(
-    axes: Any,
-    rows: Sequence[Row],
-    styles: Mapping[str, tuple[str, str]],
-    *,
-    x: str,
-    y: str,
-    label: PointLabel | None = None,
-) -> list[Label]:
+def _panel(axes: Any, rows: Rows, styles: Styles, *, x: str, y: str, label: PointLabel | None = None) -> list[Label]:
     shown: set[str] = set()
     labels = []
     for row in rows:
         colour, marker = styles[row["method"]]
-        # Without valid grasps the marker is hollow, at the upper bound, with an arrow to lower values.
+        # Without valid grasps a hollow marker with an arrow to lower values is at the upper bound.
         none = not row[x]
         at = valid_rate_bound(row) if none else row[x]
         bars: dict[str, Any] = {
@@ -207,7 +187,7 @@ def _error(row: Row, key: str) -> list[list[float]]:
     return [[max(0.0, row[key] - row[f"{key}_low"])], [max(0.0, row[f"{key}_high"] - row[key])]]
 
 
-def _label(row: Row, rows: Sequence[Row]) -> str:
+def _label(row: Row, rows: Rows) -> str:
     """Return fidelity, and batch size if it varies; the method's name if it has only one setting."""
     own = [r for r in rows if r["method"] == row["method"]]
     if len(own) == 1:
@@ -216,12 +196,12 @@ def _label(row: Row, rows: Sequence[Row]) -> str:
     return f"{row['fidelity']}, {row['batch']}" if several else str(row["fidelity"])
 
 
-def fidelity_label(row: Row, rows: Sequence[Row]) -> str:
+def fidelity_label(row: Row, rows: Rows) -> str:
     """Return the fidelity if the method has several, else no text, because the legend has its name."""
     return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
 
 
-def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
+def draw_sweeps(rows: Rows, file: Path) -> None:
     """Plot a panel per setting: success over speed, a point per value."""
     knobs = list(dict.fromkeys(row["knob"] for row in rows))
     columns = 3
@@ -254,7 +234,7 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
 Boxes = NDArray[np.float64]
 
 SIZE_PT: Final = 8
-#: Distances of a label from its point [pt], preferred ones first. From the third on, a line connects both.
+#: Distances of a label from its point [pt], preferred ones first.
 _REACHES_PT: Final = (8.0, 15.0, 26.0, 38.0, 52.0)
 #: Directions from the point, preferred ones first [degrees].
 _TURNS: Final = (30, -30, 150, -150, 90, -90, 0, 180, 60, -60, 120, -120)
@@ -277,8 +257,7 @@ class Label:
     y: float
     text: str
     colour: str
-    x_bar: tuple[float, float] | None = None
-    """Ends of the point's error bars."""
+    x_bar: tuple[float, float] | None = None  # ends of the point's error bars
     y_bar: tuple[float, float] | None = None
 
 
@@ -313,7 +292,7 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
     made = []
     for index, at in chosen.items():
         box = offered[index][at]
-        # A label far from its point, or nearer to another point, would be ambiguous without a line.
+        # A line connects a label with its point if the label is far away or nearer to another point.
         led = at // len(_TURNS) > 1 or _is_nearer_to_another(box, points, index)
         made.append(_write(axes, labels[index], points[index], box, pixels, led=led))
     return made

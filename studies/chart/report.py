@@ -41,7 +41,7 @@ ACCURACIES: Final = (("dexgraspbench", ".2f"), ("hard", ".2f"), ("robust", ".2f"
 
 
 def write(chart: Row, folder: Path) -> None:
-    """Write chart.{json,csv,md,png,svg}, chart.hands.png, and sweeps.png if there are sweeps, to a folder."""
+    """Write chart.{json,csv,md,png,svg}, chart.hands.png, and sweeps.png if there are sweeps."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "chart.json").write_text(json.dumps(chart, indent=1, allow_nan=False) + "\n")
     with (folder / "chart.csv").open("w", newline="") as stream:
@@ -65,11 +65,9 @@ def write(chart: Row, folder: Path) -> None:
 
 
 def markdown(chart: Row) -> str:
-    """Return the chart as a page: its settings, then one table per question."""
-    return _scene_page(chart) if "scene" in chart else _page(chart)
-
-
-def _page(chart: Row) -> str:
+    """Return the chart as a page in Markdown."""
+    if "scene" in chart:
+        return _scene_page(chart)
     parts = [_head(chart), summary_table(chart["summary"]), _ratios(chart["summary"])]
     if len(chart["by_hand"]) > 1:
         parts += ["## Each hand", "![Success under the DexGraspBench protocol over speed](chart.hands.png)"]
@@ -91,25 +89,19 @@ def _page(chart: Row) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def _names(chart: Row) -> tuple[str, str]:
+def _settings(chart: Row) -> tuple[str, str, str, str]:
+    """Return command, hands, objects and remark of a chart as texts for its head."""
     hands, objects = (", ".join(dict.fromkeys(run[name] for run in chart["runs"])) for name in ("hand", "object"))
-    return hands, objects
-
-
-def _command(chart: Row) -> str:
-    return f"    {chart['command']}\n\n" if chart.get("command") else ""
-
-
-def _remark(chart: Row) -> str:
-    return f" {chart['remark']}" if chart.get("remark") else ""
+    command = f"    {chart['command']}\n\n" if chart.get("command") else ""
+    return command, hands, objects, f" {chart['remark']}" if chart.get("remark") else ""
 
 
 def _head(chart: Row) -> str:
-    hands, objects = _names(chart)
+    command, hands, objects, remark = _settings(chart)
     return (
-        f"# Speed against accuracy\n\n{_command(chart)}{chart['device']}, {chart['threads']} threads, graspd "
+        f"# Speed against accuracy\n\n{command}{chart['device']}, {chart['threads']} threads, graspd "
         f"{chart['versions']['graspd']}, Warp {chart['versions']['warp']}, {chart['created']}. Hands: {hands}. "
-        f"Objects: {objects}. Settings are warmed up; their repeats are interleaved.{_remark(chart)}\n\n"
+        f"Objects: {objects}. Settings are warmed up; their repeats are interleaved.{remark}\n\n"
         f"- *valid*: held in MuJoCo (DexGraspBench protocol, level *{chart['validation']['level']}*) and feasible\n"
         "- *valid/s* and *first valid s*: time includes planning, validation, and metrics of held grasps; on a CPU a "
         "second is one core-second\n"
@@ -128,13 +120,12 @@ def summary_table(rows: Sequence[Row]) -> str:
     """Return a row per method and fidelity, the fastest first; bold if on the Pareto front."""
     lines = [
         "| method | fidelity | batch | valid/s | first valid s | held/s, planner only | dexgraspbench | hard | "
-        "robust | "
-        "ε | penetration mm | grasps |",
+        "robust | ε | penetration mm | grasps |",
         "| --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
     for row in sorted(rows, key=lambda r: -r[SPEED]):
         cells = [row["method"], row["fidelity"], row["batch"], _with_bar(row, SPEED, ".3g")]
-        cells += [_first(row["seconds_to_first_valid"]), f"{row['valid_per_second']:.3g}"]
+        cells += [_format(row["seconds_to_first_valid"], ".2g"), f"{row['valid_per_second']:.3g}"]
         for key, form in ACCURACIES:
             text = _with_bar(row, key, form)
             cells.append(f"**{text}**" if key in row["front"] else text)
@@ -149,12 +140,8 @@ def _with_bar(row: Row, key: str, form: str) -> str:
     return f"{row[key]:{form}} ± {half:.1g}" if form == ".3g" else f"{row[key]:{form}} ± {half:{form}}"
 
 
-def _share(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
-
-
-def _first(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2g}"
+def _format(value: float | None, form: str = ".2f") -> str:
+    return "–" if value is None else f"{value:{form}}"
 
 
 def _ratios(rows: Sequence[Row]) -> str:
@@ -171,8 +158,9 @@ def _ratios(rows: Sequence[Row]) -> str:
         "| --- | --: | --: | --: | --: |",
     ]
     for row in others:
-        times = f"× {best[SPEED] / row[SPEED]:.3g}" if row[SPEED] else ""
-        if not times:
+        if row[SPEED]:
+            times = f"× {best[SPEED] / row[SPEED]:.3g}"
+        else:
             times = f"> × {best[SPEED] / valid_rate_bound(row):.3g} (0 of {row['grasps']} valid)"
         lines.append(
             f"| {row['method']} {row['fidelity']} | {times} | {best['dexgraspbench'] - row['dexgraspbench']:+.2f} "
@@ -182,6 +170,7 @@ def _ratios(rows: Sequence[Row]) -> str:
 
 
 def runs_table(runs: Sequence[Row]) -> str:
+    """Return a row per run, by hand and object."""
     lines = [
         "| hand | object | method | fidelity | valid/s | dexgraspbench | hard | robust | ε | penetration mm | "
         "self mm | contact cm² |",
@@ -189,7 +178,7 @@ def runs_table(runs: Sequence[Row]) -> str:
     ]
     lines += [
         f"| {run['hand']} | {run['object']} | {run['method']} | {run['fidelity']} | {run[SPEED]:.3g} "
-        f"| {run['dexgraspbench']:.2f} | {run['hard']:.2f} | {_share(run['robust'])} | {run['epsilon']:.3f} | "
+        f"| {run['dexgraspbench']:.2f} | {run['hard']:.2f} | {_format(run['robust'])} | {run['epsilon']:.3f} | "
         f"{run['pd_mm']:.2f} | {run['spd_mm']:.2f} | {run['ca_cm2']:.1f} |"
         for run in sorted(runs, key=lambda r: (r["hand"], r["object"]))
     ]
@@ -206,9 +195,7 @@ def best_table(runs: Sequence[Row]) -> str:
         "| --- | --- | --- | --: | --: | --: | --: | --: |",
     ]
     for (hand, method, fidelity), rows in sorted(groups.items()):
-        mean = {
-            key: _mean([row[key] for row in rows]) for key in ("ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "sd_cm")
-        }
+        mean = {key: _mean(rows, key) for key in ("ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "sd_cm")}
         lines.append(
             f"| {hand} | {method} | {fidelity} | {mean['ca_cm2']:.1f} | {mean['iv_cm3']:.2f} | {mean['epsilon']:.3f} "
             f"| {mean['wrench_volume']:.2f} | {mean['sd_cm']:.2f} |"
@@ -216,8 +203,8 @@ def best_table(runs: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def _mean(values: Sequence[float | None]) -> float:
-    known = [value for value in values if value is not None]
+def _mean(rows: Sequence[Row], key: str) -> float:
+    known: list[float] = [row[key] for row in rows if row[key] is not None]
     return sum(known) / len(known) if known else float("nan")
 
 
@@ -253,21 +240,18 @@ def _scene_page(chart: Row) -> str:
         parts += [f"### {hand}\n\n{_summary(rows, time_unit(chart))}" for hand, rows in chart["by_hand"].items()]
     parts += ["## Each hand and object", _runs(chart["runs"], time_unit(chart))]
     if refused := [run for run in chart["runs"] if run["note"]]:
-        lines = [
-            f"- {run['method']} {run['fidelity']}, {run['hand']}, {run['object']}: {run['note']}" for run in refused
-        ]
+        lines = [f"- {r['method']} {r['fidelity']}, {r['hand']}, {r['object']}: {r['note']}" for r in refused]
         parts += ["## Refused", "\n".join(lines)]
     return "\n\n".join(parts)
 
 
 def _scene_head(chart: Row) -> str:
-    hands, objects = _names(chart)
+    command, hands, objects, remark = _settings(chart)
     seconds = "core-seconds of the CPU" if time_unit(chart) == "CPU second" else "wall-clock seconds"
     return (
-        f"# Grasps planned in scenes, compared with filtered free grasps\n\n{_command(chart)}{chart['device']}, graspd "
-        f"{chart['versions']['graspd']}, "
-        f"{chart['created']}. Scene: {chart['scene']['kind']}, faces {chart['scene']['faces']}. Hands: {hands}. "
-        f"Objects: {objects}.{_remark(chart)}\n\n"
+        f"# Grasps planned in scenes, compared with filtered free grasps\n\n{command}{chart['device']}, graspd "
+        f"{chart['versions']['graspd']}, {chart['created']}. Scene: {chart['scene']['kind']}, faces "
+        f"{chart['scene']['faces']}. Hands: {hands}. Objects: {objects}.{remark}\n\n"
         f"- *{IN_SCENE}*: planned for the scene\n"
         f"- *{FILTERED}*: planned around a free object and placed into the same scenes in turn; baselines have "
         "only this mode\n"
@@ -284,28 +268,25 @@ def _scene_head(chart: Row) -> str:
 def _summary(rows: Sequence[Row], second: str) -> str:
     lines = [
         "| mode | method | fidelity | candidates | clear | lifted | dexgraspbench | half friction | robust | "
-        f"lifted per {second} | planner only | {second}s to the first lift | pairs with a lift | "
-        "× filtered |",
+        f"lifted per {second} | planner only | {second}s to the first lift | pairs with a lift | × filtered |",
         "| --- | --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
-    for row in rows:
-        gain = "–" if row["gain"] is None else f"{row['gain']:.3g}"
-        lines.append(
-            f"| {row['way']} | {row['method']} | {row['fidelity']} | {row['grasps']} | {row['clear']:.2f} | "
-            f"{' | '.join(_bold(row, key) for key in IN_SCENES)} | "
-            f"{row[SPEED]:.3g} | {row['valid_per_second']:.3g} | {_first(row['seconds_to_first'])} | "
-            f"{row['pairs_with_one']} of {row['pairs']} | {gain} |"
-        )
+    lines += [
+        f"| {row['way']} | {row['method']} | {row['fidelity']} | {row['grasps']} | {row['clear']:.2f} | "
+        f"{' | '.join(_bold(row, key) for key in IN_SCENES)} | {row[SPEED]:.3g} | {row['valid_per_second']:.3g} | "
+        f"{_format(row['seconds_to_first'], '.2g')} | {row['pairs_with_one']} of {row['pairs']} | "
+        f"{_format(row['gain'], '.3g')} |"
+        for row in rows
+    ]
     note = (
         "× filtered: median ratio of planner-only speeds, in the scene to filtered, over pairs with lifted filtered "
-        "grasps. "
-        "Bold: no faster setting is better."
+        "grasps. Bold: no faster setting is better."
     )
     return "\n".join(lines) + f"\n\n{note}"
 
 
 def _bold(row: Row, key: str) -> str:
-    return f"**{_share(row[key])}**" if key in row["front"] else _share(row[key])
+    return f"**{_format(row[key])}**" if key in row["front"] else _format(row[key])
 
 
 def _runs(runs: Sequence[Row], second: str) -> str:
@@ -317,7 +298,7 @@ def _runs(runs: Sequence[Row], second: str) -> str:
     lines += [
         f"| {run['hand']} | {run['object']} | {run['way']} | {run['method']} | {run['fidelity']} | {run['grasps']} | "
         f"{run['clear']:.2f} | {run['lift']:.2f} | {run['lift_dexgraspbench']:.2f} | {run['lift_hard']:.2f} | "
-        f"{_share(run['robust'])} | {run[SPEED]:.3g} |"
+        f"{_format(run['robust'])} | {run[SPEED]:.3g} |"
         for run in runs
     ]
     return "\n".join(lines)

@@ -1,10 +1,7 @@
 """Comparison of two modes: grasps planned in a scene, and free grasps filtered in the same scene.
 
-Methods that cannot plan in scenes run only in the second mode. In both modes the grasps use the scenes of an object in
-turn. The tests are equal: clear trajectory, lift, lift under the unmodified protocol, lift at half friction, and lift
-in models around the nominal one. Speed is lifted grasps per second, on a CPU per core-second, so that other load does
-not change it. It is measured for planner and postures alone, and end to end: with trajectory, validator, and metrics of
-lifted grasps."""
+Methods that cannot plan in scenes run only in the second mode. Both modes use the scenes of an object in turn and have
+the same tests. Speed is lifted grasps per second, on a CPU per core-second, so that other load does not change it."""
 
 from __future__ import annotations
 
@@ -31,7 +28,7 @@ from graspd.studies.chart.trials import FRICTION, MODELS_SEED, SEED, WARM_SEED, 
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners import Rollout, method
+from graspd.worker.planners import method
 from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.kinds import rest_poses, supports_of
@@ -48,8 +45,7 @@ Say = Callable[[str], None]
 #: Columns with shares of all candidates.
 SHARES: Final = ("clear", "lift", "lift_dexgraspbench", "lift_hard")
 SPEEDS: Final = (("valid_per_second", "seconds"), ("end_to_end_per_second", "end_seconds"))
-#: Increase when the columns of a row change: cached results are then discarded.
-FORM: Final = 2
+FORM: Final = 2  # increase when the columns of a row change: cached results are then discarded
 #: Key of the speed in candidates, for each speed in lifted grasps.
 RAW: Final = {"valid_per_second": "grasps_per_second", "end_to_end_per_second": "candidates_end_to_end_per_second"}
 #: Time per grasp [s] from which on the time to the first grasp is not measured in an extra run.
@@ -59,14 +55,14 @@ _NOTHING: Final = {**{f"{name}_count": 0 for name in SHARES}, "robust_sum": 0.0,
 
 @dataclass
 class ObjectScenes:
-    """An object and its scenes; the scenes are created for the first setting without a cached result."""
+    """An object and its scenes, which are computed on first use."""
 
     thing: ChartObject
     spec: SceneSpec
 
     @cached_property
     def true(self) -> ObjectModel:
-        """Object of the validator: the same for all settings."""
+        """The validator's object, the same for all settings."""
         return self.thing.load(TRUE_ERROR_M)
 
     @cached_property
@@ -91,10 +87,8 @@ def scene_chart(
     keep: Callable[[Row], None],
 ) -> Row:
     """Run all settings on all pairs; a setting's `batch` is its number of grasps per pair.
-    Each lifted grasp is lifted again in `models` models around the nominal one. `work` is a folder for the results of
-    each setting and pair; an interrupted run resumes from it. `say` receives a line per cell, `keep` the partial result
-    after each pair. Return `runs[]` (one setting on one pair each), `summary[]` over the pairs, `by_hand`, `device`,
-    `created`."""
+    Each lifted grasp is lifted again in `models` models around the nominal one. An interrupted run resumes from the
+    results in the folder `work`. `say`, `keep` and the result are as in `chart`."""
     runs: list[Row] = []
     for thing in things:
         place = ObjectScenes(thing, spec)
@@ -107,39 +101,27 @@ def scene_chart(
 
 
 def _planning_modes(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
-    found = []
-    for setting in settings:
-        able = method(setting.method).in_scenes
-        found += [(setting, way) for way in (IN_SCENE, FILTERED) if able or way == FILTERED]
-    return found
+    modes = {True: (IN_SCENE, FILTERED), False: (FILTERED,)}
+    return [(setting, way) for setting in settings for way in modes[bool(method(setting.method).in_scenes)]]
 
 
 def _cached_result(
     setting: Setting, way: str, hand: HandModel, place: ObjectScenes, models: int, work: Path | None
 ) -> Row:
     """Return the setting's result on the pair, from its cache file if it exists."""
-    said = {
-        "way": way,
-        "method": setting.method,
-        "fidelity": setting.fidelity,
-        "hand": hand.name,
-        "object": place.thing.name,
-        "batch": setting.batch,
-        "options": dict(setting.options),
-    }
+    said: Row = {"way": way, "method": setting.method, "fidelity": setting.fidelity, "hand": hand.name}
+    said |= {"object": place.thing.name, "batch": setting.batch, "options": dict(setting.options)}
     if work is None:
         return said | _run_setting(setting, way, hand, place, models)
     told = place.spec.model_dump(mode="json")
     terms = [FORM, models, said, setting.knobs.model_dump(mode="json"), told, hand.digest, place.true.digest]
-    # Results also depend on the planners' code: another revision or device does not use the cache.
+    # Results also depend on revision of the planners and device.
     device = [] if setting.run.device == "cpu" else [setting.run.device]
     file = work / f"{digest_json([*terms, STAGE_REVISIONS['synthesize'], *device])}.json"
     if not file.is_file():
         work.mkdir(parents=True, exist_ok=True)
-        partial = file.with_suffix(".tmp")
-        partial.write_text(
-            json.dumps(said | _run_setting(setting, way, hand, place, models), indent=1, allow_nan=False) + "\n"
-        )
+        partial, row = file.with_suffix(".tmp"), said | _run_setting(setting, way, hand, place, models)
+        partial.write_text(json.dumps(row, indent=1, allow_nan=False) + "\n")
         partial.replace(file)
     found: Row = json.loads(file.read_text())
     return found
@@ -152,11 +134,17 @@ def _run_setting(setting: Setting, way: str, hand: HandModel, place: ObjectScene
     row: Row = {"grasps": setting.batch, "seconds": 0.0, "end_seconds": 0.0, **_NOTHING}
     note, few = "", min(setting.run.cores, setting.batch)
     clock = clock_of(setting.run.device)
+    in_scene = way == IN_SCENE
+
+    def plan(placed: PlacedGrasps, seed: int, warm: bool = False) -> GraspSet:
+        there: dict[str, Any] = {"placed": placed, "rollout": rollout} if in_scene else {}
+        return setting.grasps(hand, obj, len(placed.index), seed, warm=warm, **there)
+
     try:
-        rollout = lift_rollout(hand, obj, lambda: place.pieces) if way == IN_SCENE else None
-        _plan_grasps(setting, hand, obj, placed.take(slice(0, 1)), rollout, warm=True)
+        rollout = lift_rollout(hand, obj, lambda: place.pieces) if in_scene else None
+        plan(placed.take(slice(0, 1)), WARM_SEED, warm=True)
         began = clock()
-        grasps = _plan_grasps(setting, hand, obj, placed, rollout)
+        grasps = plan(placed, SEED)
         row["seconds"] = clock() - began
         validated = ValidatedGrasps(hand, place, grasps, placed)
         row["end_seconds"] = clock() - began
@@ -165,34 +153,19 @@ def _run_setting(setting: Setting, way: str, hand: HandModel, place: ObjectScene
         if each < _SHORT_S:
             began = clock()
             start = placed.take(slice(0, few))
-            ValidatedGrasps(hand, place, _plan_grasps(setting, hand, obj, start, rollout), start)
+            ValidatedGrasps(hand, place, plan(start, SEED), start)
             row["first_seconds"] = clock() - began
         row |= validated.counts(models)
     except InputError as error:
-        # The scene has no free approach, or the method refuses the pair.
-        note = str(error)
+        note = str(error)  # the scene has no free approach, or the method refuses the pair
     row["first_grasps"] = few
     told = lift_figures([row])
     told["seconds_to_first"] = first_valid(told["lift"], [row["first_seconds"]], few)
     return {**row, **told, "scenes": len(place.scenes.object_pose), "note": note}
 
 
-def _plan_grasps(
-    setting: Setting,
-    hand: HandModel,
-    obj: ObjectModel,
-    placed: PlacedGrasps,
-    rollout: Rollout | None,
-    *,
-    warm: bool = False,
-) -> GraspSet:
-    """Plan grasps in the scenes with a rollout, or for a free object without one."""
-    seed, there = WARM_SEED if warm else SEED, placed if rollout else None
-    return setting.grasps(hand, obj, len(placed.index), seed, placed=there, rollout=rollout, warm=warm)
-
-
 class ValidatedGrasps:
-    """Grasps with trajectories and lift verdicts; lifted ones are measured, since timing includes metrics."""
+    """Grasps with trajectories and lift verdicts; the metrics of lifted grasps are only timed."""
 
     def __init__(self, hand: HandModel, place: ObjectScenes, grasps: GraspSet, placed: PlacedGrasps) -> None:
         way = plan_trajectory(hand, place.true, grasps, placed)
@@ -210,8 +183,7 @@ class ValidatedGrasps:
         return rows[found.success == 1]
 
     def counts(self, models: int) -> Row:
-        """Count grasps that are clear, lifted, lifted by DexGraspBench's protocol and lifted at half friction.
-        Also sum, over lifted grasps, the shares of models in which they are lifted."""
+        """Return numbers of clear grasps and of lifted ones by test, and the sum of their robust shares."""
         lifted = self.lifted
         grasps, placed = self.grasps.take(lifted), self.placed.take(lifted)
         given: dict[str, Any] = {"models": models, "seed": MODELS_SEED, "pieces": self.place.pieces}
@@ -226,9 +198,8 @@ class ValidatedGrasps:
 
 
 def lift_figures(rows: Sequence[Mapping[str, Any]]) -> Row:
-    """Return shares of all candidates with 95 % intervals (Wilson), and lifted grasps per second.
-    `robust` is the mean share of models over lifted grasps. All grasps have equal weight. A refused cell has no
-    time."""
+    """Return shares of all candidates with 95 % intervals (Wilson), lifted grasps per second, and robust share.
+    All grasps have equal weight; refused cells have no time."""
     grasps = sum(row["grasps"] for row in rows)
     found: Row = {"grasps": grasps}
     for name in SHARES:
@@ -249,8 +220,8 @@ def lift_figures(rows: Sequence[Mapping[str, Any]]) -> Row:
 
 
 def summarise_runs(runs: Sequence[Row]) -> list[Row]:
-    """Return a row for each mode, method and fidelity over all pairs.
-    `gain`: median ratio of speeds, in scene to filtered, over pairs that have lifted grasps in mode filtered."""
+    """Return a row for each mode, method, fidelity and batch over all pairs.
+    `gain` is the median over pairs of the ratio of speeds, in scene to filtered, where a filtered grasp was lifted."""
     groups: dict[tuple[str, str, str, int], list[Row]] = {}
     for run in runs:
         groups.setdefault((run["way"], run["method"], run["fidelity"], run["batch"]), []).append(run)

@@ -1,4 +1,4 @@
-"""Figures of a cell with their error bars, sums over cells, and the Pareto front."""
+"""Figures of runs with error bars, their summary over pairs, and the Pareto front."""
 
 from __future__ import annotations
 
@@ -17,14 +17,13 @@ DRAWS: Final = 400
 BAR: Final = (2.5, 97.5)
 #: Accuracies, and whether more is better. The first three are not in sweeps.
 METRICS: Final = {"dexgraspbench": True, "hard": True, "robust": True, "gsr": True, "epsilon": True, "pd_mm": False}
-#: Speeds that are plotted against accuracies.
-SPEEDS: Final = ("valid_per_second", "end_to_end_per_second")
+SPEEDS: Final = ("valid_per_second", "end_to_end_per_second")  # speeds that are plotted against accuracies
 #: Metrics summarised by a cell's median; `gsr` by the mean.
 MEDIANS: Final = ("epsilon", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "wrench_volume")
 
 
 def run_figures(cell: Rollout) -> dict[str, Any]:
-    """Return the values of a run: speed, accuracy, and `KEY_low`, `KEY_high` of each."""
+    """Return speed and accuracy of a run, each with error bar `KEY_low`, `KEY_high`."""
     held, kept = (np.concatenate(rows).astype(float) for rows in (cell.success, cell.kept))
     seconds = np.array(cell.seconds)
     row: dict[str, Any] = {
@@ -51,13 +50,13 @@ def run_figures(cell: Rollout) -> dict[str, Any]:
 
 
 def widen(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
-    """Set the bar of success to Wilson's interval; widen the bar of the speed at least to this interval."""
+    """Set the bar of success to Wilson's interval; widen the bar of the speed to contain this interval."""
     row["gsr_low"], row["gsr_high"] = wilson(valid, grasps)
     widen_speed(row, "valid_per_second", valid, grasps, per_second)
 
 
 def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_second: float) -> None:
-    """Widen the bar of a speed at least to Wilson's interval of the share of valid grasps."""
+    """Widen the bar of the speed `key` to contain Wilson's interval of the share of valid grasps."""
     low, high = wilson(valid, grasps)
     row[f"{key}_low"] = min(row[f"{key}_low"], low * per_second)
     row[f"{key}_high"] = max(row[f"{key}_high"], high * per_second)
@@ -79,8 +78,8 @@ def _strict_success(cell: Rollout) -> dict[str, Any]:
 
 
 def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | None:
-    """Return expected seconds until repeated calls give a valid grasp; None if none was valid.
-    The time of a call is the median of `seconds`."""
+    """Return expected seconds until a call gives a valid grasp; None if no grasp was valid.
+    A call has `grasps` grasps, of which the given share is valid, and takes the median of `seconds`."""
     if share <= 0 or not seconds:
         return None
     return float(np.median(seconds)) / (1.0 - (1.0 - share) ** grasps)
@@ -106,8 +105,8 @@ def _draws(cell: Rollout) -> dict[str, Floats]:
 
 
 def summarise_runs(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return one row per method, fidelity and batch, over all hands and objects.
-    Speed is all valid grasps over all seconds; accuracies are means over the pairs, with bars of these means."""
+    """Return a row per method, fidelity and batch, over all hands and objects.
+    Speed is the number of valid grasps over all seconds; accuracies are means over the pairs."""
     groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for run in runs:
         groups.setdefault((run["method"], run["fidelity"], run["batch"]), []).append(run)
@@ -118,7 +117,7 @@ def summarise_runs(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"method": method, "fidelity": fidelity, "batch": batch, "pairs": len(own)}
         row["grasps"] = sum(r["grasps"] for r in own)
         row["grasps_per_second"] = row["grasps"] / seconds
-        # The time of pairs without a valid grasp is unknown; a mean without these pairs would be too good.
+        # Pairs without a valid grasp have no time, and a mean without them would be too good.
         row["seconds_to_first_valid"] = None if None in firsts else float(np.mean(firsts))
         for key in METRICS:
             # Robustness is undefined for a pair without held grasps.
@@ -139,19 +138,18 @@ def summarise_runs(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def mark_fronts(rows: Sequence[dict[str, Any]], metrics: Mapping[str, bool]) -> None:
-    """Add `front`: the accuracies in which no faster row (end to end) is better.
-    `metrics` tells for each accuracy whether more is better."""
+    """Add `front`: accuracies in which no faster row is better; `metrics` has True where more is better."""
     for row in rows:
         row["front"] = []
     for key, more in metrics.items():
-        # Exclude methods without valid grasps, since a hand without contact has no penetration either.
+        # Methods without valid grasps are excluded, since hands without contact have no penetration.
         able = [row for row in rows if row["end_to_end_per_second"] and row[key] is not None]
         for index in pareto([(row["end_to_end_per_second"], row[key] if more else -row[key]) for row in able]):
             able[index]["front"].append(key)
 
 
 def _bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:
-    """Return the bar of a mean of independent cells: half-widths added in quadrature."""
+    """Return the bar of the mean over independent pairs: half-widths added in quadrature."""
     mean = float(np.mean([r[key] for r in runs]))
     down = np.sqrt(np.sum([(r[key] - r[f"{key}_low"]) ** 2 for r in runs])) / len(runs)
     up = np.sqrt(np.sum([(r[f"{key}_high"] - r[key]) ** 2 for r in runs])) / len(runs)
@@ -159,7 +157,7 @@ def _bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:
 
 
 def _ratio_bar(runs: Sequence[dict[str, Any]], key: str, seconds: str, side: str) -> float:
-    """Return the bar of valid grasps per second, each cell weighted by its seconds."""
+    """Return one end of the bar of valid grasps per second, with pairs weighted by their seconds."""
     weight = np.array([sum(r[seconds]) for r in runs])
     value = np.array([r[key] for r in runs])
     off = np.array([r[f"{key}_{side}"] for r in runs]) - value

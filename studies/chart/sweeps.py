@@ -1,7 +1,7 @@
 """One-at-a-time sweeps of fast_graspd's settings: loss of accuracy and gain in speed.
 
-Some settings are not part of a fidelity: passes of the contact solver, culling by grid and band, and queries. By
-default the M simulations share one closest-point query per hand point; the paper's code makes M queries."""
+Some settings are not part of a fidelity: passes of the contact solver, culling by grid and band, and queries. The M
+simulations share one closest-point query per hand point; the paper's code makes M queries."""
 
 from __future__ import annotations
 
@@ -49,14 +49,11 @@ class KnobValue:
 
 
 def _options(**changes: Any) -> Change:
-    def change(pair: Pair) -> Pair:
-        return replace(pair, options=replace(pair.options, **changes))
-
-    return change
+    return lambda pair: replace(pair, options=replace(pair.options, **changes))
 
 
 def knob_values(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValue]:
-    """Return values of all settings or of the named ones (`knobs`), each setting with its default.
+    """Return the values of all settings, or of those in `knobs`, including defaults.
     With `quick`, return four values of two settings. Raises InputError: a name is not a setting."""
 
     def knob(name: str, between: str, **values: Sequence[Any]) -> list[KnobValue]:
@@ -101,9 +98,8 @@ def sweep(
     knobs: Sequence[str],
     say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
-    """Return a row per setting (`knob`) and value: `knob`, `value`, `default`, `speedup`, a run's figures.
-    Values are interleaved, repeat by repeat. `speedup` is the ratio of the default's cost to the value's. The cost is
-    in core-seconds on a CPU, independent of other load, and in wall-clock seconds on a GPU."""
+    """Return a row per setting (`knob`) and value, with its `speedup` over the default and a run's figures.
+    Values are interleaved, repeat by repeat. Times are those of `clock_of`."""
     wp.load_module(module=kernels, device=run.device)
     default = KnobValue("", "default")
     true = thing.load(TRUE_ERROR_M)
@@ -142,7 +138,7 @@ def _make(
 
 
 class QueryPerVelocity(Pair):
-    """Pair in which every simulated velocity makes its own distance queries, with equal results."""
+    """Pair in which each simulated velocity makes its own distance queries; results are equal."""
 
     def iteration(self, model: Model, data: Data, optimizer: str, patience: int) -> Launches:
         out = Launches(model.device)

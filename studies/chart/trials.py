@@ -1,4 +1,4 @@
-"""One cell of a chart: a method at a fidelity on a hand and an object, run repeatedly and validated."""
+"""Settings of a chart, and their repeated, validated runs on a hand and an object."""
 
 from __future__ import annotations
 
@@ -29,19 +29,17 @@ from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.robust import validate_robustness
 from graspd.worker.validation.validator import validate
 
-#: Coulomb coefficient for epsilon and wrench volume: the paper's.
-FRICTION: Final = 1.0
+FRICTION: Final = 1.0  # Coulomb coefficient for epsilon and wrench volume: the paper's
 #: First seed, not used for tuning of any setting; repeats use the following seeds.
 SEED: Final = 4711
 WARM_SEED: Final = 1
 #: Seed of the models around the nominal one; neither jobs nor `graspd evaluate` use it.
 MODELS_SEED: Final = 2**31 + 1
-#: Number of best grasps by epsilon per pair, as in table 2 of the paper.
-BEST: Final = 10
+BEST: Final = 10  # number of best grasps by epsilon per pair, as in table 2 of the paper
 
 
+#: Function from hand, object, number of grasps and seed to grasps.
 Make = Callable[[HandModel, ObjectModel, int, int], GraspSet]
-"""Function from hand, object, number of grasps and seed to grasps."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +47,13 @@ class Setting:
     """A compared setting: a method with its options at a fidelity."""
 
     method: str
-    fidelity: str
-    """Label of the fidelity."""
+    fidelity: str  # label of the fidelity
     knobs: Fidelity
     options: Mapping[str, Any] = field(default_factory=dict)
-    batch: int = 32
-    """Number of grasps per call; a call is one repeat."""
-    warm: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the call before the first timed one."""
+    batch: int = 32  # number of grasps per call; a call is one repeat
+    warm: Mapping[str, Any] = field(default_factory=dict)  # options of the call before the first timed one
     run: ExecutionContext = DEFAULT_CONTEXT
-    make: Make | None = None
-    """Alternative planner for sweeps of settings that are not part of a fidelity."""
+    make: Make | None = None  # alternative planner for sweeps of settings that are not part of a fidelity
 
     def grasps(
         self,
@@ -86,21 +80,16 @@ class Rollout:
 
     setting: Setting
     hand: HandModel
-    obj: ObjectModel
-    """Object for the planner."""
-    true: ObjectModel
-    """Object for metrics and validator, the same for all settings."""
-    pieces: ConvexPieces
-    """Convex pieces of `true`."""
+    obj: ObjectModel  # object for the planner
+    true: ObjectModel  # object for metrics and validator, the same for all settings
+    pieces: ConvexPieces  # convex pieces of `true`
     seconds: list[float] = field(default_factory=list)
     """Core-seconds of all threads on a CPU, independent of other load; wall-clock seconds on a GPU."""
     end_seconds: list[float] = field(default_factory=list)
     """Seconds end to end: planning, validation, and metrics of held grasps."""
     made: list[GraspSet] = field(default_factory=list)
-    success: list[NDArray[np.int8]] = field(default_factory=list)
-    """Verdicts of the standard level."""
-    kept: list[NDArray[np.int8]] = field(default_factory=list)
-    """1 if valid, that is, held and feasible."""
+    success: list[NDArray[np.int8]] = field(default_factory=list)  # verdicts of the standard level
+    kept: list[NDArray[np.int8]] = field(default_factory=list)  # 1 if valid, that is, held and feasible
     columns: list[dict[str, Floats]] = field(default_factory=list)
     first_calls: list[float] = field(default_factory=list)
     """Seconds of calls with `first_grasps` grasps, end to end."""
@@ -143,7 +132,7 @@ class Rollout:
         self.columns.append(columns)
 
     def _validate_and_measure(self, found: GraspSet) -> tuple[NDArray[np.int8], NDArray[np.int8], dict[str, Floats]]:
-        """Validate and measure grasps as in a job: return verdicts, valid flags, and columns of held grasps."""
+        """Return verdicts (N,), valid flags (N,), and metrics of held grasps, as in a job."""
         success = validate(self.hand, self.true, found, pieces=self.pieces, run=self.setting.run).success
         held = np.flatnonzero(success == 1)
         table = self._measured(found.take(held))
@@ -170,7 +159,7 @@ class Rollout:
             self.shares.append(shares)
 
     def time_first(self, grasps: int) -> None:
-        """Time a call of a few grasps; above 1 s per grasp, scale the time of the whole batch instead."""
+        """Time a call of this many grasps; above 1 s per grasp, scale the time of the last batch instead."""
         self.first_grasps = grasps
         each = self.end_seconds[-1] / self.setting.batch
         if each > 1.0:

@@ -1,7 +1,6 @@
 """Difficult objects and hands: thin, sharp, open, tiny, huge; few or many fingers, coupled drives.
 
-All are ingested like uploads. The hands are a family: equal three-joint fingers in a ring, which lean outward when
-open."""
+All are prepared like uploads. The hands have equal three-joint fingers in a ring, which lean outward when open."""
 
 from __future__ import annotations
 
@@ -25,6 +24,9 @@ from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object
+
+#: Panel, x and y of a cell.
+Place = tuple[str, float | str, float | str]
 
 MILLIMETRES: Final = 1e-3
 #: Text for maps of candidates: measure of a cell, bounds of bad values, and symptom for users.
@@ -90,20 +92,17 @@ DEFECTS: Final[dict[str, Callable[[Any], Any]]] = {
     "inside out": lambda faces: faces[:, ::-1],
     "every other face inside out": _half_inverted,
 }
-#: Defects that ingest refuses or closes.
-CLOSED: Final = tuple(name for name in DEFECTS if name != _ALLOW_OPEN)
+CLOSED: Final = tuple(name for name in DEFECTS if name != _ALLOW_OPEN)  # defects that ingest refuses or closes
 
 
 @dataclass(frozen=True)
 class MapOptions:
     """Settings of the jobs behind the cells of a map."""
 
-    count: int
-    """Number of grasps of each job."""
+    count: int  # number of grasps of each job
     fidelity: str = "draft"
     run: ExecutionContext = DEFAULT_CONTEXT
-    say: Callable[[str], None] = lambda line: None
-    """Receives a line per cell."""
+    say: Callable[[str], None] = lambda line: None  # receives a line per cell
 
 
 def shape_map(
@@ -138,24 +137,16 @@ def shape_map(
 
 
 def prepare_mesh(mesh: Any, face_error_m: float, *, allow_open: bool = False) -> ObjectModel:
-    """Prepare a mesh in metres like an upload; MeshError if it is refused."""
+    """Prepare a mesh in metres like an upload. Raises MeshError: the mesh is refused."""
     files = {"shape.ply": bytes(mesh.export(file_type="ply"))}
     digest, options = digest_files(AssetKind.OBJECT, files), {"units": "m", "allow_open": allow_open}
     return load_object(files, name="shape", digest=digest, face_error_m=face_error_m, options=options)
 
 
 def shape_cell(
-    hand: HandModel,
-    place: tuple[str, float | str, float | str],
-    mesh: Any,
-    options: MapOptions,
-    *,
-    allow_open: bool = False,
-    **asked: Any,
+    hand: HandModel, place: Place, mesh: Any, options: MapOptions, *, allow_open: bool = False, **asked: Any
 ) -> MapCell:
-    """Return the map's cell of a hand on a mesh; candidates are planned and validated as in a job.
-    `place` has panel, x and y of the cell. The `mesh` in metres is prepared like an upload; `allow_open` permits an
-    open one. `options` has size and execution context of the job, `asked` its fidelity or method."""
+    """Return the share of valid candidates of a hand on a mesh in metres; `asked` is the job's fidelity or method."""
     request = JobRequest(hand="hand", object="shape", grasps=options.count, want="candidates", rechecks=0, **asked)
     try:
         obj = prepare_mesh(mesh, request.knobs.face_error_m, allow_open=allow_open)
@@ -183,24 +174,20 @@ FINGERS: Final = (1, 2, 3, 4, 5, 6, 8)
 COUPLINGS: Final[tuple[Coupling, ...]] = ("each joint", "distal follows", "one drive per finger", "one drive")
 #: Size relative to a human hand, whose fingers are about 10 cm long.
 SIZES: Final = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
-#: Rotation of the distal joint, divided by that of the previous joint.
-RATIOS: Final = (-0.5, 0.0, 0.5, 1.0, 1.5, 2.0)
-#: Cube that these hands grasp [mm].
-CUBE_MM: Final = 50.0
+RATIOS: Final = (-0.5, 0.0, 0.5, 1.0, 1.5, 2.0)  # rotation of the distal joint over that of the middle joint
+CUBE_MM: Final = 50.0  # cube that these hands grasp [mm]
 
 #: Radius and height of the palm, lengths of the links from it outward, and their radius [m], at size 1.
 _PALM_M, _LINKS_M, _RADIUS_M = (0.032, 0.02), (0.045, 0.035, 0.027), 0.009
 #: Outward lean of open fingers, and limits of their joints [rad].
 _LEAN: Final = 0.45
 _ENDS: Final = (1.7, 1.6, 1.3)
-#: Torque of a joint of a hand of size 1 [N m].
-_EFFORT: Final = 1.0
+_EFFORT: Final = 1.0  # torque of a joint of a hand of size 1 [N m]
 
 
 def ring_hand(fingers: int, *, coupling: Coupling = "each joint", size: float = 1.0, ratio: float = 0.8) -> HandModel:
-    """Return a hand of equal fingers around a palm.
-    `coupling` names the joints that one drive moves. `size` is relative to a human hand. `ratio` is the rotation of a
-    coupled distal joint, divided by the middle joint's. Raises HandError: the hand is unusable."""
+    """Return a hand of equal fingers around a palm, of a size relative to a human hand.
+    `ratio` is the rotation of a coupled distal joint over that of the middle joint. Raises HandError: unusable."""
     radius, height = (size * x for x in _PALM_M)
     parts = [f'<robot name="ring"><link name="palm">{_solid("cylinder", -height / 2, radius, height)}</link>']
     for k in range(fingers):

@@ -1,4 +1,4 @@
-"""Stress tests of the descent: bad starts, extreme rates and weights, and far too many iterations."""
+"""Stress tests of the planner's descent: displaced starts, extreme rates and weights, 100,000 iterations."""
 
 from __future__ import annotations
 
@@ -33,8 +33,7 @@ WEIGHTS: Final = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)
 _OPTIMIZERS: Final = {"adam": "Adam", "gd": "plain descent, Adam's rates"}
 LENGTHS: Final = (100, 1_000, 10_000)
 LONG: Final = 100_000
-#: Median penetration that counts as weak and as broken [mm].
-DEPTH_MM: Final = (0.5, 2.0)
+DEPTH_MM: Final = (0.5, 2.0)  # median penetration that counts as weak and as broken [mm]
 #: Residual of the contact force balance that counts as weak and as broken; 1: no balance.
 RESIDUAL: Final = (0.35, 0.9)
 
@@ -42,10 +41,8 @@ RESIDUAL: Final = (0.35, 0.9)
 @dataclass(frozen=True)
 class Descent:
     state: HandState
-    depths: Floats
-    """(n,) deepest penetration after the projection, as in a job [m]."""
-    drift: float
-    """Largest deviation of a quaternion's norm from 1, before the projection normalises it."""
+    depths: Floats  # (n,) deepest penetration after the projection, as in a job [m]
+    drift: float  # largest deviation of a quaternion's norm from 1, before the projection normalises it
 
 
 def descend(
@@ -58,9 +55,9 @@ def descend(
     iterations: int | None = None,
     optimizer: str = "adam",
 ) -> Descent:
-    """Run coarse and fine phase and projection from given hands.
-    `rates` and `weights` are factors on the rates and on the weights of penetration. `iterations` is the length of the
-    fine phase, by default the fidelity's; beyond it the schedule's last row is repeated."""
+    """Run coarse phase, fine phase and projection from the hands `state`.
+    `rates` and `weights` are factors on the optimiser's rates and on the weights of penetration. `iterations` is the
+    length of the fine phase; beyond the fidelity's, the schedule's last row is repeated."""
     n = len(state.pivot)
     for side, schedule in ((pair.coarse, coarse_schedule(fidelity)), (pair.fine, fine_schedule(fidelity))):
         model = pair.model(side)
@@ -76,7 +73,6 @@ def descend(
         data.set_state(state)
         record_iteration(model, data, optimizer).run(steps)
         state = data.state(n)
-    # Measure the drift before the projection, which normalises quaternions.
     drift = float(np.abs(np.linalg.norm(state.rotation, axis=1) - 1.0).max())
     state, depths = Projection(model, data, AROUND).run(state, fidelity.polish_iterations)
     return Descent(state, depths, drift)
@@ -101,8 +97,7 @@ def start_map(hand: HandModel, obj: ObjectModel, *, count: int, say: Say) -> Sta
         _BOUNDS,
         mark_reachable(cells, lambda cell: cell.x == 0.0),
         "a hand that stays away has no contacts; a hand that starts inside the object stays there",
-        "the planner's own starts retreat until they are free of contact; the merit rejects hands without contact "
-        "balance, the gate rejects penetration",
+        "starts of the planner are free of contact; the merit rejects hands without balance, the gate penetration",
         "tests/studies/test_stability.py::test_a_start_that_is_too_far_is_flagged",
         reach="only 0 m, because the planner draws the starts",
     )
@@ -161,10 +156,7 @@ def length_map(hand: HandModel, obj: ObjectModel, *, lengths: Sequence[int], say
 
 
 _ORDER: Final = ("good", "weak", "broken")
-_MEASURE: Final = (
-    "median residual of balanced contact forces (1: no balance); ↓ median penetration [mm], if that is the worse "
-    "measure"
-)
+_MEASURE: Final = "median residual of balanced contact forces (1: no balance); ↓ median penetration [mm], if worse"
 _BOUNDS: Final = (
     f"weak: residual {RESIDUAL[0]:g} or {DEPTH_MM[0]:g} mm deep; "
     f"broken: {RESIDUAL[1]:g}, {DEPTH_MM[1]:g} mm, or a value that is not finite"

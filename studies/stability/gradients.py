@@ -1,4 +1,4 @@
-"""Kernel gradients in float32, compared with central differences of the float64 reference."""
+"""Gradients of the float32 kernels, compared with central differences of the float64 reference."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ from graspd.worker.simulation.model import initial_motions
 from graspd.worker.simulation.reference import Contacts, World
 
 PASSES: Final = 12
-#: Sizes of the held ball [m], and largest depth or gap of its contacts as a multiple of the step (1 mm).
+#: Radii of the held ball [m]; scale of its contacts' depths and gaps, as a multiple of the step.
 SIZES_M: Final = (0.0005, 0.002, 0.01, 0.04, 0.15, 0.5)
 GAPS: Final = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 STEP_M: Final = 1e-3
-#: Sine of the angle between the two gradients that counts as weak and as broken.
-ANGLE: Final = (0.25, 0.7)
+ANGLE: Final = (0.25, 0.7)  # sine of the angle between the two gradients that counts as weak and as broken
 #: Kernel of each solver, and its step in the reference.
 SOLVERS: Final[dict[str, tuple[Any, Solver]]] = {
     "direct": (contact.direct, partial(reference.direct, passes=PASSES)),
@@ -35,19 +34,12 @@ SOLVERS: Final[dict[str, tuple[Any, Solver]]] = {
 
 
 def run_kernel(
-    name: str,
-    contacts: Contacts,
-    world: World,
-    *,
-    leak: float = 0.0,
-    one_sided: bool = True,
-    near_gap: float = 100.0,
-    lane: int = 64,
+    name: str, contacts: Contacts, world: World, *, near_gap: float = 100.0, lane: int = 64
 ) -> tuple[Floats, Floats, Floats]:
-    """Run a kernel on the CPU: motions at the end (M, 6), losses (M,), dL/drho (N,)."""
+    """Run a kernel of `SOLVERS` on the CPU; return motions at the end (M, 6), losses (M,), dL/drho (N,)."""
     motions = initial_motions(7, world.step, world.gyration)
     n, m = len(contacts.points), len(motions)
-    physics = _physics(world, leak, one_sided, near_gap, float(np.linalg.norm(contacts.points, axis=1).max()))
+    physics = _physics(world, near_gap, float(np.linalg.norm(contacts.points, axis=1).max()))
     listed = np.flatnonzero(contacts.distances - world.dilation <= near_gap)
     with wp.ScopedDevice("cpu"):
         hands, given = kinematics.Hands(), packing.Contacts()
@@ -101,19 +93,18 @@ def gradient_map(sizes: Sequence[float], gaps: Sequence[float], *, repeats: int)
         f"weak: {ANGLE[0]:g}; broken: {ANGLE[1]:g}",
         mark_reachable(cells, lambda cell: True),
         "the loss does not fall, even with more iterations",
-        "a descent that does not improve stops after `patience` iterations; the best of several starts is selected by "
-        "the balance of forces, not by the loss",
+        "a descent without progress stops after `patience` iterations; the balance of forces selects the best start",
         "tests/studies/test_stability.py::test_gradients_agree_at_the_sizes_of_hands_and_their_objects",
         reach="all: option `contact_solver` has each value, and objects have any size",
     )
 
 
-def _physics(world: World, leak: float, one_sided: bool, near_gap: float, radius: float) -> Any:
+def _physics(world: World, near_gap: float, radius: float) -> Any:
     out = contact.Physics()
     out.mass = contact.mat66(*world.mass.ravel().tolist())
     out.inverse_mass = contact.mat66(*np.linalg.inv(world.mass).ravel().tolist())
     out.gyration, out.friction, out.stiffness = world.gyration, world.friction, world.stiffness
-    out.leak, out.leak_length, out.one_sided, out.step = leak, 0.02, int(one_sided), world.step
+    out.leak, out.leak_length, out.one_sided, out.step = 0.0, 0.02, 1, world.step
     out.radius, out.near_gap = radius, near_gap
     return out
 

@@ -1,8 +1,7 @@
 """Integrators alone: a ball thrown into a cage of contact points, step by step, in float64.
 
-The cage is fixed and the ball flies inside it. A good integrator adds no energy, keeps the ball in the cage and
-prevents penetration. Position-based integrators are those of `worker.simulation.reference`, the reference of the
-kernels' tests. The force-based one is the penalty force of Grasp'D (2022) under semi-implicit Euler."""
+A good integrator adds no energy, keeps the ball in the fixed cage and prevents penetration. Position-based integrators
+are those of `worker.simulation.reference`. The force-based one is Grasp'D's penalty force under semi-implicit Euler."""
 
 from __future__ import annotations
 
@@ -24,13 +23,12 @@ from graspd.worker.simulation.reference import Contacts, World
 Solver = Callable[[Contacts, Floats, World], Floats]
 
 RADIUS_M: Final = 0.035
-#: Gap between ball and cage at the start [m]; it is at most the ball's flight in `FLIGHT_STEPS` steps.
+#: Gap between ball and cage at the start [m]; at most the ball's motion in `FLIGHT_STEPS` steps.
 GAP_M: Final = 2e-3
 FLIGHT_STEPS: Final = 10
 STEPS: Final = 60
-#: Least penetration of a ball that counts as weak and as broken [m].
-SINK_M: Final = (5e-4, 5e-3)
-#: Least ratio of largest to initial energy that counts as weak and as broken.
+SINK_M: Final = (5e-4, 5e-3)  # penetration of a ball from which on a cell counts as weak and as broken [m]
+#: Ratio of largest to initial energy from which on a cell counts as weak and as broken.
 ENERGY: Final = (1.02, 2.0)
 #: Sliding friction of the cage, and the viscous coefficient of the force-based contact [N s/m].
 FRICTION: Final = 0.8
@@ -102,7 +100,7 @@ def force_based(*, dt: float, speed: float, stiffness: float, mass: float = 1.0)
 
 
 def _extremes(points: Floats, flight: Iterator[tuple[Floats, float]]) -> tuple[float, float]:
-    """Return largest energy and deepest penetration of a flight, given as pairs of centre and energy."""
+    """Return largest energy (inf if unstable) and deepest penetration of a flight's centres and energies."""
     most, deepest = 1.0, 0.0
     for centre, energy in flight:
         most, deepest = max(most, energy), max(deepest, _largest_depth(points, centre))
@@ -122,7 +120,7 @@ def _penalty(contacts: Contacts, v: Floats, w: Floats, stiffness: float) -> tupl
 
 
 def _largest_depth(points: Floats, centre: Floats) -> float:
-    """Return the deepest cage point's depth in the ball [m]; the ball's size once it has left the cage."""
+    """Return the depth of the deepest cage point in the ball [m]; its diameter if the ball has left the cage."""
     if float(np.linalg.norm(centre)) > 2 * RADIUS_M:
         return 2 * RADIUS_M
     return max(0.0, RADIUS_M - float(np.linalg.norm(points - centre, axis=1).min()))
@@ -133,7 +131,7 @@ def sweep(contacts: Contacts, s0: Floats, world: World) -> Floats:
 
 
 def summed_jacobi(contacts: Contacts, s0: Floats, world: World) -> Floats:
-    """Sum all contacts' corrections at once, without averaging: a form that graspd does not offer."""
+    """Return the motion after eight passes that sum the corrections of all contacts; graspd averages them."""
     inverse = np.linalg.inv(world.mass)
     s = s0.copy()
     for _ in range(8):
@@ -153,8 +151,7 @@ SOLVERS: Final[dict[str, Solver]] = {
     "Jacobi, averaged": partial(reference.jacobi, passes=8),
     "Jacobi, summed": summed_jacobi,
 }
-#: Solvers that the setting `contact_solver` offers.
-_OFFERED: Final = tuple(SOLVERS)[:3]
+_OFFERED: Final = tuple(SOLVERS)[:3]  # solvers that the setting `contact_solver` offers
 
 
 def time_step_map(time_steps: Sequence[float], speeds: Sequence[float]) -> StabilityMap:
@@ -182,8 +179,7 @@ def time_step_map(time_steps: Sequence[float], speeds: Sequence[float]) -> Stabi
         f"{SINK_M[1] * 1e3:g} mm deep",
         cells,
         "the object is thrown out of the hand, or hands penetrate it",
-        "the planner uses one step of 1 mm (time step x speed), at which its integrators are good; the validator uses "
-        "MuJoCo's implicit solver",
+        "the planner's step is always 1 mm, where its integrators are good; the validator's integrator is implicit",
         "tests/studies/test_stability.py::test_planners_own_step_lies_where_its_integrators_are_good",
         reach=f"the offered solvers at a step of {1e3 * step:g} mm; the step is no option of a job",
     )
@@ -200,8 +196,7 @@ def _ball_cell(name: str, dt: float, speed: float, found: tuple[float, float]) -
 
 
 def stiffness_map(stiffnesses: Sequence[float], masses: Sequence[float], time_steps: Sequence[float]) -> StabilityMap:
-    cells = []
-    lines = {}
+    cells, lines = [], {}
     for mass in masses:
         panel = f"penalty force, {mass:g} kg"
         for stiffness, dt in product(stiffnesses, time_steps):
@@ -234,7 +229,7 @@ def stiffness_map(stiffnesses: Sequence[float], masses: Sequence[float], time_st
 
 def contact_count_map(counts: Sequence[int]) -> StabilityMap:
     cells = [
-        _wall_cell(name, solver, count, depth, 1e-3)
+        _wall_cell(name, solver, count, depth)
         for name, solver in SOLVERS.items()
         for count in counts
         for depth in (0.0, 1e-4, 1e-3)
@@ -255,11 +250,11 @@ def contact_count_map(counts: Sequence[int]) -> StabilityMap:
     )
 
 
-def _wall_cell(name: str, solver: Solver, count: int, depth: float, step: float) -> MapCell:
-    rng = np.random.default_rng(count)
+def _wall_cell(name: str, solver: Solver, count: int, depth: float) -> MapCell:
+    rng, step = np.random.default_rng(count), 1e-3
     points = np.concatenate([0.005 * rng.normal(size=(count, 2)), np.full((count, 1), RADIUS_M)], axis=1)
     normals = np.tile([0.0, 0, 1], (count, 1))
-    # The sum of weights is constant, so that the finger's stiffness does not depend on its number of points.
+    # A constant sum of weights makes the finger's stiffness independent of its number of points.
     contacts = Contacts(points, normals, np.full(count, -depth), np.full(count, 24.0 / count))
     world = ball_world(1.0, step)
     end = solver(contacts, np.array([0, 0, step, 0, 0, 0]), world)

@@ -1,7 +1,7 @@
 """Model errors: grasps that hold in the validator's model are tested in models with a single error.
 
-Amounts of error range from the amounts of `--robust` (`worker.validation.variant`) to amounts at which few grasps are
-held. Each grasp has its own direction of displacements and rotations."""
+Amounts of error range from those of `--robust` (`worker.validation.variant`) to amounts at which few grasps hold.
+Displacements and rotations of each grasp have their own direction."""
 
 from __future__ import annotations
 
@@ -49,8 +49,7 @@ _ROUNDING: Final = 1e-9
 @dataclass(frozen=True)
 class _Error:
     amounts: tuple[float, ...]
-    drawn: tuple[float, float]
-    """Least and largest amount in `--robust`."""
+    drawn: tuple[float, float]  # least and largest amount in `--robust`
     variant: Make
 
 
@@ -102,15 +101,10 @@ ERRORS: Final[dict[str, _Error]] = {
 
 
 def model_error_map(
-    hands: Sequence[HandModel],
-    obj: ObjectModel,
-    options: MapOptions,
-    *,
-    errors: Sequence[str] = tuple(ERRORS),
-    every: int = 1,
+    hands: Sequence[HandModel], obj: ObjectModel, options: MapOptions, *, errors: Sequence[str] = (), every: int
 ) -> StabilityMap:
-    """Map the share of valid grasps that are held despite one error; `every` selects each n-th amount."""
-    cells = [cell for hand in hands for cell in _cells(hand, obj, options, errors, every)]
+    """Map the share of valid grasps that hold despite one of `errors` (default: all), each n-th (`every`) amount."""
+    cells = [cell for hand in hands for cell in _cells(hand, obj, options, errors or tuple(ERRORS), every)]
     return StabilityMap(
         "model_errors",
         f"{options.count} valid grasps of {obj.name}, validated in models with errors",

@@ -26,16 +26,14 @@ COLOURS: Final = {
     "broken": ("#96261c", "#ffffff"),
     "refused": ("#e7e9ec", "#4b565e"),
 }
-#: Largest number of panels in a row.
-_COLUMNS: Final = 3
+_COLUMNS: Final = 3  # largest number of panels in a row
 #: Sizes of the numbers on cells [pt], largest first; if the last does not fit, the cell is blank.
 _FONT_SIZES: Final = (7.0, 6.0, 5.0)
-#: Tick labels are wrapped at this number of characters.
-_TICK_LETTERS: Final = 14
+_TICK_LETTERS: Final = 14  # tick labels are wrapped at this number of characters
 
 
 def write(found: Stability, folder: Path) -> list[Path]:
-    """Write `stability.json`, `stability.md` and a plot for each map."""
+    """Write `stability.json`, `stability.md` and a plot of each map; return the files."""
     folder.mkdir(parents=True, exist_ok=True)
     written = [folder / "stability.json", folder / "stability.md"]
     written[0].write_text(json.dumps(found.as_json(), indent=1, allow_nan=False) + "\n")
@@ -47,7 +45,7 @@ def write(found: Stability, folder: Path) -> list[Path]:
 
 
 def markdown(found: Stability) -> str:
-    """Return the page: remaining failures, then each map with symptom, guard and test."""
+    """Return a page in Markdown: remaining failures, then each map with symptom, guard and test."""
     said = ", ".join(f"{name} {value}" for name, value in found.versions.items())
     lines = ["# Failure maps", "", f"`{found.command}`; {said}.", "", *_unguarded_failures(found.maps)]
     for one in found.maps:
@@ -63,7 +61,7 @@ def markdown(found: Stability) -> str:
 
 
 def _unguarded_failures(maps: Sequence[StabilityMap]) -> list[str]:
-    """Return broken cells that a job can reach: failures that no guard prevents."""
+    """Return a section with counts of the cells that a job can reach, and with broken ones among them."""
     lines = ["## What still breaks", ""]
     lines += ["Counts of cells that a job can reach. Other cells need settings that jobs do not have."]
     lines += ["", "| map | good | weak | broken | refused | remaining failures | symptom |"]
@@ -80,7 +78,7 @@ def _row(cells: Sequence[MapCell]) -> str:
 
 
 def draw(one: StabilityMap, path: Path) -> None:
-    """Plot one panel per method or family, with one square per cell."""
+    """Plot a map with a square per cell."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
@@ -119,8 +117,7 @@ def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
         edge: dict[str, Any] = {"edgecolor": "#14191d", "linewidth": 1.4} if framed else {"linewidth": 0}
         axes.add_patch(Rectangle((at[0] - 0.46, at[1] - 0.46), 0.92, 0.92, facecolor=fill, **edge))
         axes.text(*at, cell.text, ha="center", va="center", color=ink)
-    axes.set_xlim(-0.5, len(xs) - 0.5)
-    axes.set_ylim(-0.5, len(ys) - 0.5)
+    axes.set(xlim=(-0.5, len(xs) - 0.5), ylim=(-0.5, len(ys) - 0.5))
     axes.set_xticks(range(len(xs)), [_wrapped(x) for x in xs], fontsize=8)
     axes.set_yticks(range(len(ys)), [_wrapped(y) for y in ys], fontsize=8)
     axes.set_xlabel(one.x, fontsize=9)

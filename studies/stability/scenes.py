@@ -1,4 +1,4 @@
-"""Difficult scenes: flat and tall objects on a table, walls and neighbours, too small or big objects."""
+"""Difficult scenes: flat and tall objects on a table, walls and neighbours, too small or large objects."""
 
 from __future__ import annotations
 
@@ -37,8 +37,7 @@ WALLS: Final[dict[str, tuple[tuple[int, int], ...]]] = {
     "two opposite": ((1, 0), (-1, 0)),
     "four": ((1, 0), (-1, 0), (0, 1), (0, -1)),
 }
-#: Height and thickness of a wall [mm]: higher than the reach of any hand.
-WALL_MM: Final = (300, 20)
+WALL_MM: Final = (300, 20)  # height and thickness of a wall [mm]: higher than the reach of any hand
 #: Neighbours of the target's size, on its four sides and at its four corners.
 NEIGHBOURS: Final[dict[str, tuple[tuple[int, int], ...]]] = {
     "one": ((1, 0),),
@@ -54,8 +53,7 @@ _FEWER: Final = (
     "a grasp without a clear trajectory or without a lift is never valid; a run whose budget ends reports how many "
     "it found; a scene without a free approach is refused with a message"
 )
-#: A box's sides [mm], and the scene in which it stands.
-Placement = tuple[tuple[float, ...], SceneSpec]
+Placement = tuple[tuple[float, ...], SceneSpec]  # a box's sides [mm], and the scene in which it stands
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,7 @@ def _upright_box(sides_mm: tuple[float, ...], around: Iterable[Box] = ()) -> Pla
 
 
 def _walls(directions: Sequence[tuple[int, int]], gap_mm: float) -> list[Box]:
-    """Return walls three times as long as high, so that their ends are far away."""
+    """Return walls at a gap from the target; they are three times as long as high."""
     high, thick = (value * MILLIMETRES for value in WALL_MM)
     found = []
     for x, y in directions:
@@ -173,7 +171,7 @@ def _cell(hand: HandModel, x: float | str, y: float | str, placement: Placement,
 
 
 def plan_candidates(hand: HandModel, sides_mm: Sequence[float], spec: SceneSpec, options: MapOptions) -> ValidatedBatch:
-    """Return candidates of a box of these sides [mm] in a scene; the box is prepared like an upload.
+    """Return validated candidates for a box of these sides [mm] in a scene.
     Raises GraspdError: the box or the scene is refused."""
     mesh: Any = trimesh.creation.box(np.asarray(sides_mm) * MILLIMETRES)
     count, fidelity = options.count, options.fidelity

@@ -10,30 +10,21 @@ from typing import Any, Final
 from graspd.service.model.studies import StabilityMap, mark_reachable
 from graspd.studies.stability import assets, descents, gradients, integrators, model_errors, scenes
 from graspd.studies.stability.assets import BOUNDS, FAMILIES, MEASURE, SHOWS, MapOptions, shape_cell
+from graspd.studies.stability.descents import Say
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.prepare import object_from_path
 
-#: Further hands, for effects of size and structure.
-OTHER_HANDS: Final = ("barrett",)
-#: Values on an axis of a map.
-Values = Sequence[Any]
-#: Hands for effects of different drives.
-ALL_HANDS: Final = ("allegro", "barrett", "shadow")
+OTHER_HANDS: Final = ("barrett",)  # further hands, for effects of size and structure
+Values = Sequence[Any]  # values on an axis of a map
+ALL_HANDS: Final = ("allegro", "barrett", "shadow")  # hands for effects of different drives
 
 
 def run(
-    names: Sequence[str],
-    hand: str,
-    obj: str,
-    *,
-    quick: bool,
-    long: bool,
-    work: ExecutionContext,
-    say: Callable[[str], None],
+    names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, work: ExecutionContext, say: Say
 ) -> list[StabilityMap]:
-    """Return the maps of the named studies, in the order of the names."""
+    """Return the maps of the named studies; `say` receives a line per cell."""
     model, thing = hand_from_path(hand), object_from_path(obj)
 
     def few(values: Sequence[float]) -> Sequence[float]:
@@ -131,8 +122,7 @@ def baseline_map(
         BOUNDS,
         mark_reachable(cells, lambda cell: True),
         SHOWS,
-        "grasps with deep penetration, or rejected by the validator, are never valid; a job with too few valid "
-        "grasps reports it",
+        "gate and validator reject bad grasps; a job with too few valid grasps reports it",
         "tests/studies/test_stability.py::test_a_job_whose_every_grasp_is_bad_ends_with_none",
         reach="all: a job may use any method",
     )

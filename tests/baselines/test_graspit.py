@@ -121,5 +121,5 @@ def test_annealing_lowers_energy_and_keeps_states_that_differ() -> None:
 def test_a_hand_that_fits_nowhere_is_told() -> None:
     boards = [trimesh.creation.box((0.8, 0.8, 0.03)).apply_translation([0, 0, 0.045 * k]) for k in range(-10, 11)]
     shelves = load_pair(two_finger_hand(), object_from_mesh(trimesh.util.concatenate(boards)), "cpu", kernels)
-    with pytest.raises(InputError, match="no free place"):
+    with pytest.raises(InputError, match="no collision-free start"):
         Search(shelves).run([[0]], steps=FIRST_STEP + 1, keep=1, tell=StepCounter(1, DEFAULT_CONTEXT))

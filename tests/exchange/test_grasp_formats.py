@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from graspd.client.dataset_commands import read_spec
 from graspd.commands.exchange import read_sets
-from graspd.commands.studies import _read_maps as read_stability
+from graspd.commands.studies import _read as read_study
 from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, published
 from graspd.exchange.bench_hand import _read as read_mapping
 from graspd.exchange.bench_scene import object_of_scene, save_record
@@ -20,6 +20,7 @@ from graspd.exchange.inputs import expand_path, load_case
 from graspd.exchange.published import friction
 from graspd.exchange.scoring import write_scored
 from graspd.service.model.errors import InputError
+from graspd.service.model.studies import from_json
 from graspd.service.model.transforms import compose, quat_to_matrix
 from graspd.service.readers.trajectories import scene_spec_of
 from graspd.service.store.shards import Shard, read_shard, write_shard
@@ -230,7 +231,7 @@ REFUSED = {
     "no file of reference grasps: KeyError": lambda at: load_case(listed(at, "{}")),
     "cannot be read: No such file": lambda at: graspgen.read(at / "none.json", **GIVEN),
     "has no .npy files": lambda at: load_case(at, **GIVEN),
-    "holds no dictionary": lambda at: load_case(kept(at, np.zeros(3)), **GIVEN),
+    "is no dictionary": lambda at: load_case(kept(at, np.zeros(3)), **GIVEN),
     "has no pregrasp_qpos": lambda at: load_case(kept(at, {}), **GIVEN),
     "numbers of pregrasps, .* differ": lambda at: load_case(
         kept(at, QPOS | {"grasp_qpos": np.zeros((2, 15))}), **GIVEN
@@ -286,7 +287,7 @@ def test_an_export_does_not_write_over_another(format_: str, on_tables: Path, tm
         ("spec.toml", read_spec),
         ("reference.json", friction),
         ("hand_mapping.json", read_mapping),
-        ("stability.json", read_stability),
+        ("stability.json", lambda path: read_study(path, "stability", from_json)),
         ("provenance.json", lambda path: with_provenance(Contents.__new__(Contents), path)),
     ],
 )

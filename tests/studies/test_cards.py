@@ -60,6 +60,10 @@ CHECK = ("sha256sum", "-c", "--strict", "checksums.sha256")
 MANY = [f"object-{number:03}" for number in range(200)]
 
 
+def no_progress(done: int, total: int) -> None:
+    pass
+
+
 @dataclass
 class Case:
     """A dataset's services and snapshot, its contents, the folder of its card, and the card's figures."""
@@ -80,7 +84,7 @@ def case(folder: Path, *, drawn: bool = True, **options: Any) -> Case:
     snapshot = actions.take_snapshot(services, NAME)[0]
     contents = contents_of_store(services.store, NAME, cache=folder / "cache")
     if drawn:
-        card = write_card(contents, folder / "card", licence="CC-BY-4.0")
+        card = write_card(contents, folder / "card", licence="CC-BY-4.0", progress=no_progress)
     else:
         card = undrawn(contents)
         (folder / "card").mkdir()
@@ -207,7 +211,7 @@ def test_a_folder_of_shards_has_the_same_figures(kitchen: Case, export: Path) ->
 def test_what_a_folder_does_not_know_is_said_to_be_missing(export: Path, tmp_path: Path) -> None:
     shutil.copytree(export, tmp_path / "plain")
     (tmp_path / "plain" / "snapshot.json").unlink()
-    write_card(contents_of_folder(tmp_path / "plain"), tmp_path / "plain")
+    write_card(contents_of_folder(tmp_path / "plain"), tmp_path / "plain", progress=no_progress)
     page = (tmp_path / "plain" / "README.md").read_text()
     assert completed(CHECK, cwd=tmp_path / "plain").returncode == 0
     assert "| revisions of the stages | not recorded |" in page
@@ -217,7 +221,7 @@ def test_what_a_folder_does_not_know_is_said_to_be_missing(export: Path, tmp_pat
 def test_pictures_without_their_grasps_have_no_card(kitchen: Case, tmp_path: Path) -> None:
     pictures = replace(kitchen.contents, shards=Shards(kitchen.contents.shards.of("views")))
     with pytest.raises(InputError, match="has no base shard"):
-        write_card(pictures, tmp_path)
+        write_card(pictures, tmp_path, progress=no_progress)
 
 
 def test_licences_can_be_given_for_what_was_added_without(kitchen: Case, tmp_path: Path) -> None:

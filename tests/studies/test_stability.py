@@ -202,7 +202,7 @@ def validated(monkeypatch: pytest.MonkeyPatch, name: str, amounts: tuple[float, 
     monkeypatch.setitem(ERRORS, name, replace(ERRORS[name], amounts=amounts))
     backend.start_warp()
     hand, obj = hand_from_path("barrett"), object_from_path("block")
-    return model_error_map([hand], obj, MapOptions(3), errors=[name]).cells
+    return model_error_map([hand], obj, MapOptions(3), errors=[name], every=1).cells
 
 
 def test_the_models_friction_keeps_what_holds_ice_keeps_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,8 +29,7 @@ log = logging.getLogger(__name__)
 
 def _set_thread_defaults() -> None:
     """Give every thread its own default device, since Warp has one for the process.
-    A `ScopedDevice` would move another thread's arrays to its device and leave it as the default. This access to Warp's
-    internals is needed until every array names its device."""
+    Otherwise a `ScopedDevice` would move another thread's arrays to its device. Warp offers no public API for this."""
     from warp._src.context import Runtime, runtime  # noqa: TID251
 
     first, own = runtime.default_device, threading.local()
@@ -91,24 +90,20 @@ def kernel_cache() -> Path | None:
     return folder
 
 
-#: Environment variable with the folder of precompiled kernels.
-VARIABLE: Final = "GRASPD_KERNELS"
-#: Compute capabilities, times ten, of A100, H100 and H200, and B200.
-ARCHITECTURES: Final = (80, 90, 100)
+VARIABLE: Final = "GRASPD_KERNELS"  # environment variable with the folder of precompiled kernels
+ARCHITECTURES: Final = (80, 90, 100)  # compute capabilities, times ten, of A100, H100 and H200, and B200
 
 
 def kernel_modules() -> list[str]:
+    """Return the names of all modules with kernels."""
     names = [
         info.name
         for package in map(import_module, ("graspd.worker", "graspd.baselines", "graspd.studies"))
         for info in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
         if not info.ispkg
     ]
-    return [name for name in names if (".kernels." in name or name.endswith(".kernels")) and _has_kernels(name)]
-
-
-def _has_kernels(name: str) -> bool:
-    return any(isinstance(value, wp.Kernel) for value in vars(import_module(name)).values())
+    candidates = (name for name in names if "kernels" in name.split("."))
+    return [name for name in candidates if any(isinstance(v, wp.Kernel) for v in vars(import_module(name)).values())]
 
 
 def compile_modules(

@@ -14,17 +14,15 @@ GRASPS_PER_MULTIPROCESSOR: Final = 8
 #: Largest memory of a grasp, at fidelity `paper` [bytes], and the used share of the free memory.
 BYTES_PER_GRASP: Final = 2.5 * 2**20
 MEMORY_SHARE: Final = 0.5
-#: Largest number of batches per launch: the queue seldom has more batches of one pair.
-MOST: Final = 64
+MOST: Final = 64  # largest number of batches per launch: the queue seldom has more batches of one pair
 #: Largest memory of a process with the models of its cached pairs [bytes]; see docs/explanation/performance.md.
 BYTES_PER_PROCESS: Final = 400 * 2**20
-#: Share of the machine's memory for these processes.
-PROCESS_SHARE: Final = 0.25
+PROCESS_SHARE: Final = 0.25  # share of the machine's memory for these processes
 
 
 def batches_at_once(device: str, join: int | None) -> int:
     """Return the batches per launch on a Warp device: `join` if given, else 1 on the CPU.
-    On a GPU the default fills the GPU within its free memory. On the CPU larger launches gain nothing."""
+    On a GPU the default fills the GPU within its free memory."""
     if join is not None or not device.startswith("cuda"):
         return join or 1
     import warp as wp
@@ -42,8 +40,8 @@ def batches_that_fit(multiprocessors: int, free_bytes: int) -> int:
 
 def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: int = 1, root: Path = ROOT) -> int:
     """Return how many processes validate and measure: `wanted` if not 0; 1 for the worker's threads alone.
-    By default a worker on a GPU has one process fewer than its share of the cores. All `workers` together use at most a
-    quarter of the memory. On a CPU the planner needs all cores, so the default is 1."""
+    On a GPU the default is one less than the worker's share of the cores, within a quarter of the memory for all
+    `workers`. On a CPU the planner needs all cores, so the default is 1."""
     if wanted or not device.startswith("cuda"):
         return wanted or 1
     room = int(PROCESS_SHARE * available_memory(root) / workers / BYTES_PER_PROCESS)

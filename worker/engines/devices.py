@@ -1,8 +1,8 @@
 """Warp devices: their names, the default GPU of a process, and GPU errors.
 
-Worker number k takes the k-th GPU that `CUDA_VISIBLE_DEVICES` shows, cyclically. A process without a number takes the
-GPU with the fewest processes. File locks count these processes: the n-th process on a GPU holds lock n. Locks are in
-the user's cache, which containers of one machine share. The kernel releases them at the end of the process.
+Worker number k takes the k-th GPU that `CUDA_VISIBLE_DEVICES` shows, cyclically; a process without a number the GPU
+with the fewest processes. The n-th process on a GPU holds file lock n in the user's cache, which containers of one
+machine share. The kernel releases locks at the end of a process.
 
 After an illegal access, a reset or a bus error Warp writes a line to stderr and continues with undefined memory.
 Results therefore leave the process only after synchronisation of the device."""
@@ -23,10 +23,8 @@ from graspd.service import user_cache
 from graspd.service.model.errors import GraspdError, InputError
 
 log = logging.getLogger(__name__)
-#: Largest number of processes counted per GPU; more make no difference.
-_MOST: Final = 64
-#: Locks of this process, held until it ends.
-_held: list[IO[bytes]] = []
+_MOST: Final = 64  # largest number of processes counted per GPU; more make no difference
+_held: list[IO[bytes]] = []  # locks of this process, held until it ends
 
 
 class Device:
@@ -92,10 +90,8 @@ def visible_gpus() -> list[Gpu]:
 
 @dataclass(frozen=True)
 class Gpu:
-    name: str
-    """Warp name: cuda:0, ..."""
-    id: str
-    """Identifier common to all processes and containers of the machine."""
+    name: str  # Warp name: cuda:0, ...
+    id: str  # identifier common to all processes and containers of the machine
     model: str = ""
 
 
@@ -121,11 +117,10 @@ def _lock(file: Path) -> bool:
     opened = file.open("ab")
     try:
         fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+    except OSError as error:
         opened.close()
-        return False
-    except OSError:
-        opened.close()
+        if isinstance(error, BlockingIOError):
+            return False
         raise
     _held.append(opened)
     return True
@@ -133,8 +128,6 @@ def _lock(file: Path) -> bool:
 
 #: Messages of Warp and the driver about insufficient GPU memory.
 _NO_MEMORY: Final = re.compile(r"Failed to allocate \d+ bytes.*'cuda:\d+'|CUDA error 2\b|out of memory", re.DOTALL)
-
-
 #: Held during a launch on a GPU that another thread may use: a graph under capture must contain no other launches.
 exclusive: Final = threading.RLock()
 

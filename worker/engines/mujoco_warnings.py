@@ -1,7 +1,7 @@
-"""MuJoCo's warnings: detection of invalid results, and no log file in the user's working folder.
+"""MuJoCo's warnings: detection of invalid results, and no log file in the working folder.
 
 After a numerical divergence MuJoCo resets the state and continues: an object back at its initial pose would count as
-held. By default each warning is appended to MUJOCO_LOG.TXT in the working folder."""
+held."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
 """Pool of processes on this machine, one core each; `worker.pool.child` is the process itself.
 
-Threads share Python's lock: work that holds it for a tenth of its time does not fill 16 cores. Processes are started
-fresh, since a CUDA context and the threads of an engine do not survive a fork. They end when the parent ends, which
-closes their pipes. Python's `ProcessPoolExecutor` would import the program that calls `graspd.synthesize` once more in
-each process."""
+Threads share Python's lock: work that holds it for a tenth of its time does not fill 16 cores. Processes start fresh,
+since CUDA contexts and threads do not survive a fork; they end with the parent. Python's `ProcessPoolExecutor` would
+import the program that calls `graspd.synthesize` once more in each process."""
 
 from __future__ import annotations
 

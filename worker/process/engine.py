@@ -173,14 +173,13 @@ class TaskResources:
     """Resources of a task besides its message, and the memory limit above which a worker is replaced."""
 
     def __init__(self, settings: Settings, store: Store, device: Device) -> None:
-        self.settings = settings
-        self.store = store
-        self._device = device
+        self.settings, self.store, self._device = settings, store, device
         self._memory_mb = settings.worker_max_memory_mb or available_memory() / 2 / 2**20
 
     def memory_excess(self) -> str:
-        beside = sum(resident_mb(pid) for pid in pool.pids) if (pool := vars(self).get("_pool")) is not None else 0.0
-        if (held := resident_mb() + beside) > self._memory_mb:
+        """Return how far this process and its pool exceed the memory limit, in words; "" if they do not."""
+        pool: Pool | None = vars(self).get("_pool")  # not yet made before the first task
+        if (held := resident_mb() + sum(map(resident_mb, pool.pids if pool else ()))) > self._memory_mb:
             return f"it uses {held:.0f} MiB, more than {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
         return ""
 
@@ -205,6 +204,7 @@ class TaskResources:
         return Pool(count, MODULES) if count > 1 else None
 
     def close(self) -> None:
+        """End the pool, if there is one."""
         if (pool := vars(self).get("_pool")) is not None:
             pool.close()
 

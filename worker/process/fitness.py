@@ -1,11 +1,10 @@
 """Fitness of a worker: an unfit worker returns tasks, which lose no attempt, and goes into quarantine.
 
-A worker is unfit in two cases. Its engine fails the check, before the first task or after a task failed for another
-reason than its input. Or several different tasks fail here in a row, while other workers completed two of them.
+A worker is unfit if its engine fails the check, before the first task or after a failure not due to the task's input.
+It is also unfit if several tasks fail here in a row, of which other workers completed two.
 
 A worker in quarantine is listed with the reason and gets no tasks. It repeats its check after increasing pauses and
-resumes when the check passes. If the check never passes, or cannot find the fault, the process ends and a fresh one
-starts with a check."""
+resumes when the check passes. If it never passes, or cannot find the fault, the process ends and a fresh one starts."""
 
 from __future__ import annotations
 
@@ -27,8 +26,7 @@ from graspd.worker.process.selfcheck import EngineError
 log = logging.getLogger(__name__)
 Check = Callable[[Collection[Stage]], None]  # check of the engine for some stages; raises EngineError
 PAUSES_S: Final = (2.0, 5.0, 10.0, 20.0)  # pauses before the checks of a worker in quarantine [s]
-#: Least number of tasks that failed here and succeeded elsewhere at which a worker is unfit.
-_DONE_ELSEWHERE: Final = 2
+_DONE_ELSEWHERE: Final = 2  # least number of tasks that failed here and succeeded elsewhere at which a worker is unfit
 _REMEMBERED: Final = 16
 _LOSSES_BYTES: Final = 2**16
 _LOOK_S: Final = 0.1
@@ -38,7 +36,7 @@ _OF_THE_TASK: Final = (InputError, TaskRefused, DamagedError)
 
 def is_first_loss(task: str) -> bool:
     """Check whether a task loses a GPU or pool process for the first time on this machine.
-    The first loss is no failed attempt of the task. Later losses count, so that a task that causes them ends."""
+    Only later losses count as failed attempts, so that a task that causes them ends."""
     file = user_cache.cache_folder("gpus") / f"{hashlib.sha256(task.encode()).hexdigest()[:32]}.lost"
     if user_cache.load(file) is not None:
         return False
@@ -49,10 +47,8 @@ def is_first_loss(task: str) -> bool:
 class Fitness:
     def __init__(self, store: Store, check: Check | None = None) -> None:
         """Without `check`, only results of other workers decide."""
-        self._store = store
-        self._check = check
+        self._store, self._check, self._can_pass = store, check, True
         self._failed: dict[str, tuple[Stage, str]] = {}
-        self._can_pass = True
         self.reason = ""  # reason why the worker is unfit; "" while it is fit
 
     def try_engine(self, stages: Collection[Stage]) -> bool:
@@ -103,10 +99,7 @@ class Fitness:
 
     def _done_elsewhere(self, *, except_for: str) -> list[str]:
         try:
-            return [
-                task
-                for task, (stage, output) in self._failed.items()
-                if task != except_for and shard_exists(self._store, stage, output)
-            ]
+            others = [(task, made) for task, made in self._failed.items() if task != except_for]
+            return [task for task, made in others if shard_exists(self._store, *made)]
         except UnavailableError:
             return []

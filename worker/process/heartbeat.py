@@ -19,9 +19,7 @@ from graspd.service.queue.rq_queue import register_worker, unregister_worker
 from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
-#: Longest interval of heartbeats [s]. A cancelled task must stop within two seconds, and the worker looks for
-#: cancellations at this interval.
-BEAT_S: Final = 0.8
+BEAT_S: Final = 0.8  # longest interval of heartbeats and of checks for cancellation, which must take effect in 2 s [s]
 _SHORTEST_INTERVAL_S: Final = 0.1  # least interval between two updates [s]
 _ANSWER_S: Final = 3.0  # longest wait for a response of Redis [s]
 

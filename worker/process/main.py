@@ -1,8 +1,8 @@
 """Worker process: RQ's worker, which renews the lease of a task while a separate engine runs it.
 
-The engine (`worker.process.engine`) is its own process and lives as long as the worker: a CUDA context does not survive
-a fork. A new process for each task would load kernels and meshes every time. The worker shares no interpreter lock with
-the engine, so neither a kernel compilation nor a busy machine can prevent the renewal of the lease."""
+The engine (`worker.process.engine`) lives as long as the worker: a CUDA context does not survive a fork, and a process
+per task would load kernels and meshes every time. Worker and engine share no interpreter lock, so no kernel compilation
+prevents the renewal of the lease."""
 
 from __future__ import annotations
 
@@ -41,8 +41,7 @@ from graspd.worker.stages.context import StopReason
 log = logging.getLogger(__name__)
 _PATIENCE: Final = 60  # reconnection attempts of a worker, for about a minute: longer than a restart of Redis
 _WORKER_TTL_S: Final = 20  # RQ's `worker_ttl` [s]: RQ waits this time less 15 s for a task before its maintenance
-#: RQ's maintenance is off: see docs/adr/0003-silence-is-measured-by-one-clock.md.
-_NEVER_S: Final = 10**9
+_NEVER_S: Final = 10**9  # RQ's maintenance is off: see docs/adr/0003-silence-is-measured-by-one-clock.md
 _REFUSED_PAUSE_S: Final = 0.5
 _LONGEST_RETRY_S: Final = 2.0  # longest wait between two attempts to reach Redis [s]
 _LOOK_S: Final = 0.1  # longest delay until a worker notices a request to stop [s]
@@ -251,12 +250,8 @@ def run_worker(
             return False
         worker.check_service()  # an empty Redis may belong to another service by now
         patient = burst and idle_s > 0
-        worker.work(
-            burst=burst and not patient,
-            max_jobs=max_tasks,
-            max_idle_time=idle_s if patient else None,
-            logging_level="WARNING",
-        )
+        wait = {"burst": burst and not patient, "max_idle_time": idle_s if patient else None}
+        worker.work(**wait, max_jobs=max_tasks, logging_level="WARNING")
     except EngineLost as error:
         log.error("this worker ends: %s", error)
         return False

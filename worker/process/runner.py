@@ -61,11 +61,8 @@ class Runner:
         check_device: Callable[[str], None] = check_device,
     ) -> None:
         """`check_device` raises DeviceLost once a device no longer works."""
-        self._stages = stages
-        self._worker = worker
-        self._publish = publish
-        self._fitness = fitness
-        self._check_device = check_device
+        self._stages, self._worker, self._publish = stages, worker, publish
+        self._fitness, self._check_device = fitness, check_device
         self.device_lost = ""  # reason why this process can run no more tasks on its device; "" while it can
 
     def run(self, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
@@ -88,9 +85,8 @@ class Runner:
             return self._event(EventKind.DEFERRED, message, message=str(error))
         except Exception as error:
             if is_disk_full(error):
-                return self._event(
-                    EventKind.DEFERRED, message, message=f"{os.strerror(errno.ENOSPC)}: {_one_line(error)}"
-                )
+                why = f"{os.strerror(errno.ENOSPC)}: {_one_line(error)}"
+                return self._event(EventKind.DEFERRED, message, message=why)
             if (why := self._loss(error, context)) and is_first_loss(message.task_id):
                 log.error("the task is returned to the queue: %s", why, exc_info=True)
                 return self._event(EventKind.RETURNED, message, message=why)
@@ -116,13 +112,12 @@ class Runner:
         seconds = time.perf_counter() - clock
         if made is not None and isinstance(message, TaskMessage):
             context.check()
-            manifest, data = shard_of(
-                message, made, device=context.device, seconds=seconds, worker=self._worker, lost=lost
-            )
+            device, worker = context.device, self._worker
+            manifest, data = shard_of(message, made, device=device, seconds=seconds, worker=worker, lost=lost)
             if lost is not None and manifest.sha256 != lost.sha256:
                 raise DamagedShard(
                     f"{lost.key} was made again with another content: first on {lost.device} by graspd "
-                    f"{lost.code_version}, now on {context.device}; restore a copy"
+                    f"{lost.code_version}, now on {device}; restore a copy"
                 )
             publish_shard(context.store, manifest, data)
         if self._fitness is not None:
@@ -142,8 +137,8 @@ class Runner:
     def _is_done(self, message: Message, context: TaskContext) -> bool:
         if isinstance(message, IngestMessage):
             return context.store.exists(names.asset_check_key(message.kind, message.digest))
-        is_there = shard_exists(context.store, message.stage, message.output)
-        return is_there and context.store.exists(names.shard_file_key(message.stage, message.output))
+        file = names.shard_file_key(message.stage, message.output)
+        return shard_exists(context.store, message.stage, message.output) and context.store.exists(file)
 
     def _lost_manifest(self, message: Message, context: TaskContext) -> ShardManifest | None:
         """Return the manifest of a shard that was made before but has lost its file."""
@@ -154,7 +149,7 @@ class Runner:
     def _stopped(self, message: Message, context: TaskContext, started: str) -> Event | None:
         reason = context.stop_reason
         if reason is StopReason.TIMEOUT:
-            error = TimeoutError("the task took longer than GRASPD_TASK_TIMEOUT_S allows")
+            error = TimeoutError("the task exceeded the time limit GRASPD_TASK_TIMEOUT_S")
             return self._failed(message, error, context, started)
         kind = _STOPPED.get(reason) if reason is not None else EventKind.CANCELLED
         return None if kind is None else self._event(kind, message, output=output_of(message))
@@ -229,5 +224,4 @@ def is_disk_full(error: BaseException | None) -> bool:
 
 
 def _one_line(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return text[:500] if text else type(error).__name__
+    return " ".join(str(error).split())[:500] or type(error).__name__

@@ -17,11 +17,10 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import GraspdError
 from graspd.service.model.libraries import pause_garbage_collection
 from graspd.service.model.states import Stage
+from graspd.worker.execution_context import ExecutionContext
 
 if TYPE_CHECKING:
     from graspd.worker.objects.model import ObjectModel
-
-from graspd.worker.execution_context import ExecutionContext
 
 log = logging.getLogger(__name__)
 _RADIUS_M: Final = 0.03
@@ -57,9 +56,8 @@ def _check_synthesis(run: ExecutionContext) -> None:
 
     request = JobRequest(hand=_HAND, object="ball", grasps=1, fidelity="draft", want="candidates")
     found = validated_grasps(hand_from_path(_HAND), _ball(), request, count=1, run=run)
-    _expect(
-        len(found.grasps) == 1 and np.isfinite(found.grasps.grasp.hand_pose).all(), "a grasp of a ball is not finite"
-    )
+    finite = np.isfinite(found.grasps.grasp.hand_pose).all()
+    _expect(len(found.grasps) == 1 and finite, "a grasp of a ball is not finite")
 
 
 def _check_scene(run: ExecutionContext) -> None:

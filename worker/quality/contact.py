@@ -11,12 +11,10 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.hands.digits import finger_of_body
 from graspd.worker.hands.model import HandModel
 
-#: A body closer than this is in contact [m] (DexGraspBench).
-LINK_CONTACT_M: Final = 0.002
+LINK_CONTACT_M: Final = 0.002  # a body closer than this is in contact [m] (DexGraspBench)
 #: Cap of contact distances in the contact distance consistency [m] (DexGraspBench's contact margin).
 CONSISTENCY_CAP_M: Final = 0.010
-#: Largest number of contacts of a wrench space: with more contacts the cost of its hull grows, but its radius hardly
-#: does.
+#: Largest number of contacts of a wrench space; more increase the cost of its hull, but hardly its radius.
 MAX_CONTACTS: Final = 20
 
 

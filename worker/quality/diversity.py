@@ -14,32 +14,27 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 
-#: Number of surface points of the hand for the comparison of two postures, spread evenly.
-POINTS: Final = 64
-#: Pairs of grasps compared at a time.
-_PAIRS: Final = 4096
+POINTS: Final = 64  # number of surface points of the hand for the comparison of two postures, spread evenly
+_PAIRS: Final = 4096  # pairs of grasps compared at a time
 
 
 def explained_variance(posture: Posture) -> Floats:
     """Compute the explained variance (K,) of translation, rotation vector and joints, largest share first.
-    The entries are shares of variance along the principal components; empty for fewer than 2 grasps. Diversity D is the
-    first entry: near 1, all grasps vary along one line; lower is more diverse. Units stay metres and radians, as in
-    DexGraspBench."""
+    Entries are shares along the principal components; empty for fewer than 2 grasps. Diversity D is the first entry:
+    near 1, all grasps vary along one line. Units stay metres and radians, as in DexGraspBench."""
     if len(posture) < 2:
         return np.zeros(0)
-    features = np.hstack(
-        [posture.hand_pose[:, :3], _rotation_vector(posture.hand_pose[:, 3:]), posture.joint_positions]
-    )
-    singular = np.linalg.svd(features - features.mean(axis=0), compute_uv=False)
-    variance = singular**2
+    translation, quaternion = posture.hand_pose[:, :3], posture.hand_pose[:, 3:]
+    features = np.hstack([translation, _rotation_vector(quaternion), posture.joint_positions])
+    variance = np.linalg.svd(features - features.mean(axis=0), compute_uv=False) ** 2
     total = float(variance.sum())
     return variance / total if total > 0 else np.zeros(len(variance))
 
 
 def hand_points(hand: HandModel, posture: Posture) -> Floats:
     """Return the positions (N, P, 3) of the same `POINTS` surface points in N postures, object frame [m].
-    The distance of two grasps is the mean distance of these points [m]. It covers the hand's pose and its joints, each
-    weighted by the motion that it causes. Grasps that are equivalent by the object's symmetry count as different."""
+    The mean distance of these points is the distance of two grasps. Grasps that the object's symmetry makes equivalent
+    count as different."""
     points = sample_surface(hand, POINTS)
     poses = body_poses(hand, posture.hand_pose, posture.joint_positions)
     return np.asarray(apply(poses[:, points.body], points.position))
@@ -69,8 +64,8 @@ def least_distance(points: Floats) -> float | None:
 
 
 def distinct_mask(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool_]:
-    """Return a mask (N,) of grasps at least `least` [m] apart, by their `points` (N, P, 3).
-    Earlier grasps take precedence; the first `given` are always selected. `least` 0 selects all."""
+    """Return a mask (N,) of grasps at least `least` [m] apart, by points (N, P, 3); all True if it is 0.
+    Earlier grasps take precedence; the first `given` are always selected."""
     kept = np.ones(len(points), bool)
     if least <= 0 or len(points) < 2:
         return kept

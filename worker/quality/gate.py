@@ -8,18 +8,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Deepest hand-object penetration [mm]: about the deformation of a finger pad under load, and a fifth of the field's
-#: usual limit of 10 mm.
+#: Deepest hand-object penetration [mm]: about a finger pad's deformation, and a fifth of the usual limit of 10 mm.
 MAX_PENETRATION_MM: Final = 2.0
-#: Deepest hand-hand penetration [mm]: in hand models, collision shapes of neighbouring links overlap by about this
-#: much.
+#: Deepest hand-hand penetration [mm]: collision shapes of links in hand models overlap by about this much.
 MAX_SELF_PENETRATION_MM: Final = 3.0
 #: Fewest links in contact: a single link cannot hold an object against gravity in every direction.
 MIN_CONTACT_LINKS: Final = 2
-
-
-#: Names of the gates, in the order in which they are checked.
-GATES: Final = ("penetration", "self_penetration", "contacts")
+GATES: Final = ("penetration", "self_penetration", "contacts")  # in the order in which they are checked
 
 
 def failed_gate(quality: Mapping[str, NDArray[Any]]) -> list[str]:

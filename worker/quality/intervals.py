@@ -7,8 +7,7 @@ from typing import Final
 
 from scipy.stats import binomtest
 
-#: Quantile of the normal distribution that leaves 2.5 % above.
-_Z: Final = 1.959963984540054
+_Z: Final = 1.959963984540054  # quantile of the normal distribution that leaves 2.5 % above
 
 
 def wilson(part: int, whole: int) -> tuple[float, float]:

@@ -23,8 +23,7 @@ from graspd.worker.simulation.launches import launch
 #: Points per CPU thread, and hands at a time: their data fits the cache.
 CPU_LANE: Final = 64
 CPU_HANDS: Final = 128
-#: Hands at a time on a GPU.
-GPU_HANDS: Final = 4096
+GPU_HANDS: Final = 4096  # hands at a time on a GPU
 
 
 class PostureData:
@@ -42,8 +41,7 @@ class PostureData:
                 wp.load_module(module=module, device=self.device)
             self.chain, self.points = chain_of(probe.hand, self.device), _points(probe)
             self.effort = wp.array(probe.hand.effort, dtype=wp.float64)
-            #: (L,) finger of each body; -1 without finger.
-            self.finger = wp.array(finger, dtype=wp.int32)
+            self.finger = wp.array(finger, dtype=wp.int32)  # (L,) finger of each body; -1 without finger
 
     def parts(self, count: int) -> list[slice]:
         return [slice(i, min(i + self.at_once, count)) for i in range(0, count, self.at_once)]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -22,7 +23,7 @@ from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.topology import face_areas
-from graspd.worker.simulation.device import DeviceHand, posed_bodies, to_xyzw
+from graspd.worker.simulation.device import DeviceHand, bounding_ball, posed_bodies, to_xyzw
 from graspd.worker.simulation.kernels import distance as kernels
 from graspd.worker.simulation.launches import launch
 from graspd.worker.simulation.sampling import object_samples
@@ -30,14 +31,10 @@ from graspd.worker.simulation.sampling import object_samples
 #: Number of hand points that measure contact area and penetration; the optimiser uses other points.
 HAND_POINTS: Final = 2000
 OBJECT_POINTS: Final = 3000
-#: Seed of a held-out sample, since metrics must not be measured at the points of the optimisation.
-SEED: Final = 7919
-#: Distances are capped at this [m].
-REACH_M: Final = 0.012
-#: Number of cells along the longest side of a coarse grid; the grid finds points beyond reach.
-COARSE_CELLS: Final = 32
-#: Hand and object normals of a contact are opposite to within 60 degrees.
-FACING_COS: Final = -0.5
+SEED: Final = 7919  # seed of a held-out sample, since metrics must not be measured at the points of the optimisation
+REACH_M: Final = 0.012  # distances are capped at this [m]
+COARSE_CELLS: Final = 32  # number of cells along the longest side of a coarse grid; the grid finds points beyond reach
+FACING_COS: Final = -0.5  # hand and object normals of a contact are opposite to within 60 degrees
 
 
 @dataclass(frozen=True)
@@ -46,24 +43,18 @@ class NearestPoints:
 
     bodies: Floats
     hand_points: Floats
-    hand_normals: Floats
-    """(B, N, 3) outward unit normals of the hand at its points."""
-    distance: Floats
-    """(B, N) signed distance of hand points to the object, at most the requested reach."""
-    closest: Floats
-    """(B, N, 3) closest points on the object."""
-    normal: Floats
-    """(B, N, 3) gradient of the distance: the object's outward unit normal at the point; 0 beyond reach."""
+    hand_normals: Floats  # (B, N, 3) outward unit normals of the hand at its points
+    distance: Floats  # (B, N) signed distance of hand points to the object, at most the requested reach
+    closest: Floats  # (B, N, 3) closest points on the object
+    normal: Floats  # (B, N, 3) gradient of the distance: the object's outward unit normal at the point; 0 beyond reach
 
 
 @dataclass(frozen=True)
 class Distances(NearestPoints):
     """Nearest points, the distances of P pieces from the object, and the depth of the hand in itself."""
 
-    piece_distance: Floats
-    """(B, P) least distance of an object point to each piece, at most `REACH_M`; negative inside."""
-    self_depth: Floats
-    """(B,) depth of the deepest hand point inside another, non-neighbouring body."""
+    piece_distance: Floats  # (B, P) least distance of an object point to each piece, at most `REACH_M`; negative inside
+    self_depth: Floats  # (B,) depth of the deepest hand point inside another, non-neighbouring body
 
 
 class Probe:
@@ -124,9 +115,8 @@ class Probe:
             if wp.get_device().is_cpu:
                 # Cached on disk: every process needs the grid at its start, and it depends on the object alone.
                 terms = (obj.content, binary_name(kernels))
-                kept = cached_arrays(
-                    "coarse_grids", terms, (sys.modules[__name__],), make, fits=lambda kept: _is_grid(kept, counts)
-                )
+                fits = partial(_is_grid, counts=counts)
+                kept = cached_arrays("coarse_grids", terms, (sys.modules[__name__],), make, fits=fits)
             else:
                 kept = make()
             skin.coarse = wp.array(kept["coarse"], dtype=wp.float32)
@@ -148,8 +138,7 @@ class Probe:
         with wp.ScopedDevice(self.device):
             given = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
             distance = wp.empty(count, dtype=wp.float32)
-            closest = wp.empty(count, dtype=wp.vec3)
-            normal = wp.empty(count, dtype=wp.vec3)
+            closest, normal = (wp.empty(count, dtype=wp.vec3) for _ in range(2))
             launch(kernels.mesh_distance, count, inputs=[self.skin, reach, given], outputs=[distance, closest, normal])
         place = closest.numpy().astype(float) + self.obj.centre_of_mass
         return distance.numpy().astype(float), place, normal.numpy().astype(float)
@@ -167,8 +156,8 @@ class Probe:
         return gap.numpy().astype(float)
 
     def posed_points(self, bodies: Floats) -> Floats:
-        body, position = self.points.body, self.points.position
-        return _turned(bodies, body, position) + bodies[:, body, :3]
+        """Return the hand points (B, N, 3) for body poses (B, L, 7), object frame [m]."""
+        return _turned(bodies, self.points.body, self.points.position) + bodies[:, self.points.body, :3]
 
     def touch(self, posture: Posture, *, reach: float = REACH_M) -> NearestPoints:
         """Return the object's surface near the hand points of B postures, within `reach` [m]."""
@@ -186,6 +175,7 @@ class Probe:
         )
 
     def measure(self, posture: Posture) -> Distances:
+        """Measure all distances of B postures from the object, within `REACH_M`."""
         found = self.touch(posture)
         return Distances(
             **vars(found),
@@ -195,20 +185,14 @@ class Probe:
 
     def facing(self, found: NearestPoints) -> NDArray[np.bool_]:
         """Return a mask (B, N) of points whose hand surface faces the object; other points cannot press."""
-        cosine = np.einsum("bni,bni->bn", found.hand_normals, found.normal)
-        facing: NDArray[np.bool_] = cosine < FACING_COS
-        return facing
+        return np.asarray(np.einsum("bni,bni->bn", found.hand_normals, found.normal) < FACING_COS)
 
     def body_distance(self, found: Distances) -> Floats:
         """Return the least distance (B, L) [m] between each body and the object, from points of both."""
-        least = np.full((len(found.bodies), self.hand.bodies), REACH_M)
+        least = np.empty((len(found.bodies), self.hand.bodies))
         for body in range(self.hand.bodies):
-            mine = self.points.body == body
-            if mine.any():
-                least[:, body] = found.distance[:, mine].min(axis=1)
-            own = self._piece_body == body
-            if own.any():
-                least[:, body] = np.minimum(least[:, body], found.piece_distance[:, own].min(axis=1))
+            near = [found.distance[:, self.points.body == body], found.piece_distance[:, self._piece_body == body]]
+            least[:, body] = np.concatenate(near, axis=1).min(axis=1, initial=REACH_M)
         return least
 
     def self_depth(self, bodies: Floats, points: Floats) -> Floats:
@@ -238,25 +222,19 @@ class Probe:
 
 def _turned(bodies: Floats, body: NDArray[np.integer[Any]], vectors: Floats) -> Floats:
     """Rotate vectors (N, 3) with their bodies (N,); return (B, N, 3)."""
-    rotation = quat_to_matrix(bodies[..., 3:])
-    turned: Floats = np.einsum("bnij,nj->bni", rotation[:, body], vectors)
-    return turned
+    return np.asarray(np.einsum("bnij,nj->bni", quat_to_matrix(bodies[..., 3:])[:, body], vectors))
 
 
 def _by_body(points: SurfacePoints, bodies: int) -> Any:
     """Return points of a hand as `kernels.distance.BodyPoints`, on the current device."""
     order = np.argsort(points.body, kind="stable")
     first = np.searchsorted(points.body[order], np.arange(bodies + 1))
-    position, middle, extent = points.position[order], np.zeros((bodies, 3)), np.zeros(bodies)
-    for body in range(bodies):
-        mine = position[first[body] : first[body + 1]]
-        if len(mine):
-            middle[body] = (mine.min(axis=0) + mine.max(axis=0)) / 2
-            # Slightly more than the largest distance, since kernels round.
-            extent[body] = np.linalg.norm(mine - middle[body], axis=1).max() + 1e-6
+    position = points.position[order]
+    middle, radius = zip(*(bounding_ball(position[start:end]) for start, end in pairwise(first)), strict=True)
     out = kernels.BodyPoints()
     out.first, out.position = wp.array(first, dtype=wp.int32), wp.array(position, dtype=wp.vec3d)
-    out.middle, out.extent = wp.array(middle, dtype=wp.vec3d), wp.array(extent, dtype=wp.float32)
+    out.middle = wp.array(np.array(middle), dtype=wp.vec3d)
+    out.extent = wp.array(np.array(radius) + 1e-6, dtype=wp.float32)  # slightly larger, since kernels round
     return out
 
 

@@ -36,8 +36,7 @@ Columns = dict[str, NDArray[np.generic]]
 #: Contact thresholds [m]: a small one from the literature, that of the paper (Table 2), and that of DDGC.
 DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
 DEFAULT_FRICTION: Final = 1.0
-#: Grasps per thread at a time: few enough for a quick cancellation, enough to fill a kernel launch.
-CHUNK: Final = 16
+CHUNK: Final = 16  # grasps per thread at a time: few enough for a quick cancellation, enough to fill a kernel launch
 
 
 class _Pair:
@@ -45,8 +44,8 @@ class _Pair:
         hand, obj = terms.hand, terms.obj
         self.obj, self.friction = obj, terms.friction
         self.thresholds = np.array(terms.thresholds)
-        told = int(np.argmin(np.abs(self.thresholds - INDEX_THRESHOLD_M)))
-        self.with_volume = (np.arange(len(self.thresholds)) == told) | terms.every_volume
+        indexed = np.argmin(np.abs(self.thresholds - INDEX_THRESHOLD_M))
+        self.with_volume = (np.arange(len(self.thresholds)) == indexed) | terms.every_volume
         self.probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
         self.region, self.measures = terms.region, terms.measures
         self.volume = SharedVolume(hand, obj)
@@ -87,9 +86,8 @@ def measure(
         run: receives the number of finished grasps; polled for cancellation between chunks."""
     thresholds = np.asarray(thresholds_m, float)
     if thresholds.ndim != 1 or not len(thresholds) or (thresholds <= 0).any() or (thresholds > REACH_M).any():
-        raise InputError(
-            f"contact thresholds must be above 0 and at most {REACH_M * 1e3:g} mm; got {list(thresholds_m)}"
-        )
+        limit = f"above 0 and at most {REACH_M * 1e3:g} mm"
+        raise InputError(f"contact thresholds must be {limit}; got {list(thresholds_m)}")
     terms = _Terms(hand, obj, friction, tuple(thresholds.tolist()), every_volume, region)
     chunks = [slice(i, min(i + CHUNK, len(grasps))) for i in range(0, len(grasps), CHUNK)]
     postures = [Posture(grasps.grasp.hand_pose[chunk], grasps.grasp.joint_positions[chunk]) for chunk in chunks]

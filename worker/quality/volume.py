@@ -16,13 +16,13 @@ from graspd.service.model.transforms import Floats, apply, pose_to_matrix
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.surface import piece_distance
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.topology import face_vectors
 from graspd.worker.quality.probe import Distances, Probe
 from graspd.worker.simulation.device import to_xyzw
 from graspd.worker.simulation.kernels import crossing as kernels
 from graspd.worker.simulation.launches import launch
 
-#: Edge of a voxel [m]: the error is at most half an edge times the surface of the shared volume.
-VOXEL_M: Final = 5e-4
+VOXEL_M: Final = 5e-4  # edge of a voxel [m]: the error is at most half an edge times the surface of the shared volume
 #: Solids are built in millimetres: the tolerance of manifold3d's single precision suits numbers around 100.
 _UNIT: Final = 1e3
 
@@ -98,14 +98,13 @@ def _solid(vertices: Floats, faces: NDArray[np.int32]) -> m3d.Manifold | None:
     return solid if feasible else None
 
 
-#: Planes that are equal in this many decimals (offsets [m] and unit normals) count as one.
-_DIGITS: Final = 7
+_DIGITS: Final = 7  # planes that are equal in this many decimals (offsets [m] and unit normals) count as one
 
 
 class Overlap:
     """Conservative overlap test of a hand's pieces with a closed object.
-    A piece is excluded only if no face of the object reaches into it and neither body contains a part of the other. A
-    face also counts as reaching in if only a plane through an edge of each separates face and piece."""
+    A piece is excluded only if no face of the object may reach into it and neither body contains a part of the
+    other."""
 
     def __init__(self, hand: HandModel, probe: Probe) -> None:
         self._probe = probe
@@ -133,15 +132,10 @@ class Overlap:
         given = np.concatenate([poses[:, :3] - centre, to_xyzw(poses[:, 3:])], axis=1)
         with wp.ScopedDevice("cpu"):
             crossed = wp.zeros(len(piece), dtype=wp.int32)
-            inputs = [
-                self._probe.mesh.id,
-                self._solids,
-                wp.array(piece, dtype=wp.int32),
-                wp.array(given, dtype=wp.transform),
-            ]
+            inputs = [wp.array(piece, dtype=wp.int32), wp.array(given, dtype=wp.transform)]
+            inputs = [self._probe.mesh.id, self._solids, *inputs]
             launch(kernels.faces_in_solids, len(piece), inputs=inputs, outputs=[crossed], device="cpu")
-            found: NDArray[np.bool_] = crossed.numpy() != 0
-        return found
+        return np.asarray(crossed.numpy() != 0)
 
 
 def _solids(pieces: tuple[ConvexPiece, ...]) -> Any:
@@ -160,8 +154,7 @@ def _solids(pieces: tuple[ConvexPiece, ...]) -> Any:
 
 def _planes(piece: ConvexPiece) -> Floats:
     """Return the distinct planes (F, 4) n x <= d of a piece's faces; every corner is below all of them."""
-    a, b, c = (piece.vertices[piece.faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
+    normal = face_vectors(piece.vertices, piece.faces)
     length = np.linalg.norm(normal, axis=1)
     normal = normal[length > 0] / length[length > 0, None]
     offset = (normal @ piece.vertices.T).max(axis=1)
@@ -171,8 +164,6 @@ def _planes(piece: ConvexPiece) -> Floats:
 
 
 def penetration_depth(found: Distances) -> Floats:
-    """Return the deepest penetration (B,) of hand points in the object or object points in the hand [m].
-    One direction alone is not enough: a thin wall passes between hand points, a small fingertip between object
-    points."""
+    """Return the deepest penetration (B,) of hand points in the object or object points in the hand [m]."""
     hand_in_object = np.maximum(0.0, -found.distance).max(axis=1)
     return np.asarray(np.maximum(hand_in_object, np.maximum(0.0, -found.piece_distance).max(axis=1)))

@@ -21,10 +21,8 @@ from graspd.worker.simulation.kernels import hull as kernels
 from graspd.worker.simulation.launches import launch
 
 EDGES: Final = 8
-#: Ratio of least to largest singular value below which a set of wrenches is flat.
-FLATNESS: Final = 1e-7
-#: Number of points from which this module's hull is faster than Qhull.
-MANY: Final = 24
+FLATNESS: Final = 1e-7  # ratio of least to largest singular value below which a set of wrenches is flat
+MANY: Final = 24  # number of points from which this module's hull is faster than Qhull
 
 
 def tangents(normals: Floats) -> tuple[Floats, Floats]:
@@ -100,17 +98,14 @@ def _flat(points: Floats) -> bool:
 #: Random shift of the points, as a share of the largest coordinate, so that no 7 of them lie in one hyperplane. Smaller
 #: shifts leave slivers with planes dominated by rounding; larger ones distort. On cubes the volume is off by 4e-8.
 JOGGLE: Final = 1e-8
-#: Largest number of simultaneous facets: 160 random points have some 13,000.
-CAPACITY: Final = 40_000
-#: Entries of the hash table of ridges; inserting one point creates some thousands at most.
-_TABLE: Final = 1 << 16
+CAPACITY: Final = 40_000  # largest number of simultaneous facets: 160 random points have some 13,000
+_TABLE: Final = 1 << 16  # entries of the hash table of ridges; inserting one point creates some thousands at most
 MAX_POINTS: Final = 512
 _DIMENSION: Final = 6
 #: A point above a plane by less than this share of the largest coordinate counts as on it. Products of coordinates have
 #: rounding errors of some 1e-15; the error of ε is not larger than this share.
 _ROUNDING: Final = 1e-13
-#: Ratio of least to greatest distance in the initial simplex below which points count as flat.
-_FLAT: Final = 1e-6
+_FLAT: Final = 1e-6  # ratio of least to greatest distance in the initial simplex below which points count as flat
 _LAST_STAMP: Final = 2**31 - 2 * MAX_POINTS
 
 
@@ -153,11 +148,10 @@ _workspace = _Workspace()
 
 
 def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Compute inner radius and volume of many hulls, in one launch.
-    Each hull uses the first `count` (H,) of its points `clouds` (H, P, 6), P at most `MAX_POINTS`. Where `whole` (H,)
-    is false, only the hull's part nearest to the origin is built. The radius is equally exact, in a tenth of the time.
-    Return the distance (H,) from the origin to the nearest facet, at most 0 for an outside origin. Also return the
-    volume (H,), nan for a part. Both are nan where there is no closed hull of at most `CAPACITY` facets."""
+    """Compute inner radius and volume (H,) of many hulls, in one launch; nan where a hull fails.
+    Each hull uses the first `count` (H,) of its points `clouds` (H, P, 6), P at most `MAX_POINTS`. The radius is the
+    distance from the origin to the nearest facet, at most 0 for an outside origin. Where `whole` (H,) is false, only
+    the part nearest to the origin is built: a tenth of the time, equally exact, without a volume."""
     radius, volume = np.full((2, len(clouds)), np.nan)
     some = np.flatnonzero(np.asarray(count) > _DIMENSION)
     if not len(some):

@@ -1,7 +1,7 @@
 """Data of a simulation on its device: states of up to `capacity` hands, contacts, and schedules.
 
-All per-iteration values (dilation, weights, rates) are in tables on the device. A counter on the device selects the
-row, so every iteration is the same list of launches."""
+Values of an iteration (dilation, weights, rates) are rows of tables on the device, which a counter there selects. Every
+iteration is therefore the same list of launches."""
 
 from __future__ import annotations
 
@@ -53,16 +53,16 @@ class Data:
     """Arrays for up to `capacity` hands of a model; `worker.simulation.record` has the operations."""
 
     def __init__(self, model: Model, capacity: int, *, serial: bool | None = None) -> None:
-        """`serial`: threads of a launch run in order; by default on a CPU.
-        Otherwise contacts are first packed in the order of their points, so that sums are the same bit for bit."""
+        """`serial`: whether threads of a launch run in order, by default on a CPU.
+        Otherwise contacts are packed in the order of their points, so that their sums do not depend on threads."""
         self.device, self.capacity = model.device, capacity
         self.serial = not wp.get_device(model.device).is_cuda if serial is None else serial
         self.unit = joint_units(model.hand.model)
         with wp.ScopedDevice(self.device):
             self.contacts = allocate_contacts(capacity, model.count)
             self.marked = None if self.serial else allocate_contacts(capacity, model.count, marked=True)
-            #: Number of contacts, and number of near contacts, in every chunk of marks (B, N / chunk).
             chunks = (capacity, -(-model.count // packing.CHUNK))
+            #: Number of contacts, and number of near contacts, in every chunk of marks (B, N / chunk).
             self.chunk_counts = [wp.zeros(chunks, dtype=wp.int32) for _ in range(2)]
             self.depths = kinematics.Depths()
             for kind in _DEPTHS:
@@ -89,30 +89,24 @@ class Data:
         self.end, self.adjoint = (wp.zeros((B, M), dtype=contact.vec6) for _ in range(2))
         self.gradient, self.first, self.second = (wp.zeros((B, 6 + D), dtype=wp.float32) for _ in range(3))
         self.best, self.waited = wp.zeros(B, dtype=wp.float32), wp.zeros(B, dtype=wp.int32)
-        #: The arrays `_HANDS` as a struct for kernels.
-        self.hands = kinematics.Hands()
+        self.hands = kinematics.Hands()  # the arrays `_HANDS` as a struct for kernels
         for name in _HANDS:
             setattr(self.hands, name, getattr(self, name))
 
     def set_state(self, state: HandState, *, dilation: Floats | None = None) -> None:
-        """Load n hands, at most `capacity`; switch off all others, and clear the optimiser's moments.
+        """Load n hands, at most `capacity`; switch off all others, and reset the optimiser.
         `dilation` (n,) multiplies the schedule's dilation for each hand; by default 1."""
         n = len(state.pivot)
         scale = np.ones(self.capacity, dtype=np.float32)
-        if dilation is not None:
-            scale[:n] = dilation
+        scale[:n] = 1.0 if dilation is None else dilation
         self.dilation_scale.assign(scale)
-        mask = np.zeros(self.capacity, dtype=np.int32)
-        mask[:n] = 1
         self._assign(self.pivot, state.pivot)
         self._assign(self.rotation, to_xyzw(state.rotation))
         self._assign(self.q, state.q)
-        self.active.assign(mask)
-        self.iteration.zero_()
-        self.first.zero_()
-        self.second.zero_()
+        self.active.assign((np.arange(self.capacity) < n).astype(np.int32))
         self.best.fill_(1e9)
-        self.waited.zero_()
+        for array in (self.iteration, self.first, self.second, self.waited):
+            array.zero_()
 
     def deactivate(self, hands: NDArray[np.bool_]) -> None:
         """Switch off the hands of a mask (n,): kernels skip them from the next iteration on."""
@@ -127,12 +121,12 @@ class Data:
         self.scene.assign(padded)
 
     def set_schedule(self, schedule: Schedule) -> None:
-        """Upload the per-iteration tables, with dilations up to `MAX_DILATION`.
-        Launches recorded before still read the former tables."""
+        """Upload a schedule, dilations up to `MAX_DILATION`; launches recorded before keep the former one."""
         with wp.ScopedDevice(self.device):
             self.schedule = Tables(schedule, self.unit)
 
     def deepest(self, n: int) -> Floats:
+        """Return the deepest penetration (n,) of the first n hands, as last evaluated [m]."""
         return np.max([getattr(self.depths, kind).numpy()[:n] for kind in _DEPTHS], axis=0)
 
     def near_share(self, reach: float, n: int) -> Floats:
@@ -144,6 +138,7 @@ class Data:
         return share.numpy().astype(float)
 
     def state(self, n: int) -> HandState:
+        """Download the first n hands."""
         pivot, rotation, q = (array.numpy()[:n].astype(float) for array in (self.pivot, self.rotation, self.q))
         return HandState(pivot, to_wxyz(rotation), q)
 
@@ -155,12 +150,11 @@ class Data:
 
 @dataclass
 class HandState:
-    """State of B hands: pivot (B, 3), rotation (B, 4) w x y z, q (B, D).
-    The pivot is the palm centre relative to the object's centre of mass."""
+    """State of B hands."""
 
-    pivot: Floats
-    rotation: Floats
-    q: Floats
+    pivot: Floats  # (B, 3) palm centre relative to the object's centre of mass [m]
+    rotation: Floats  # (B, 4) w x y z
+    q: Floats  # (B, D)
 
     def __getitem__(self, index: Any) -> HandState:
         return HandState(self.pivot[index], self.rotation[index], self.q[index])

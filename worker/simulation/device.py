@@ -14,6 +14,7 @@ from graspd.worker.hands.jaws import prismatic_dofs
 from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.topology import face_vectors
 from graspd.worker.simulation.grids import add_grid, faces_of
 from graspd.worker.simulation.kernels import chain as kernels
 from graspd.worker.simulation.kernels import kinematics, nearest, pieces, surface
@@ -71,7 +72,6 @@ def _add_joints(out: Any, hand: HandModel, vector: Any, quaternion: Any, number:
 def _device_pieces(hand: HandModel) -> Any:
     out = pieces.Pieces()
     size, position, rotation, half, planes = zip(*map(_piece_row, hand.pieces), strict=True)
-    starts = np.concatenate([[0], np.cumsum([len(p) for p in planes])])
     apart = np.ones((hand.bodies, hand.bodies), dtype=np.int32) - np.eye(hand.bodies, dtype=np.int32)
     for a, b in hand.neighbours:
         apart[a, b] = apart[b, a] = 0
@@ -81,7 +81,7 @@ def _device_pieces(hand: HandModel) -> Any:
     out.pose_p = wp.array(np.array(position), dtype=wp.vec3)
     out.pose_q = wp.array(to_xyzw(np.array(rotation)), dtype=wp.quat)
     out.half = wp.array(np.array(half), dtype=wp.vec3)
-    out.first_plane = wp.array(starts, dtype=wp.int32)
+    out.first_plane = wp.array(np.cumsum([0, *map(len, planes)]), dtype=wp.int32)
     out.planes = wp.array(np.concatenate([*planes, np.zeros((1, 4))]), dtype=wp.vec4)
     out.apart = wp.array(apart, dtype=wp.int32)
     return out
@@ -108,14 +108,12 @@ def _piece_row(piece: ConvexPiece) -> tuple[Floats, Floats, Floats, Floats, Floa
 
 
 def face_planes(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats:
-    """Return distinct face planes (K, 4) of a convex solid: outward unit normal and offset.
-    Coplanar faces are merged."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
+    """Return the planes (K, 4) of a convex solid's sides: outward unit normal and offset [m]."""
+    normal = face_vectors(vertices, faces)
     length = np.linalg.norm(normal, axis=1)
     keep = length > 1e-14
     normal = normal[keep] / length[keep, None]
-    planes = np.column_stack([normal, np.einsum("ij,ij->i", normal, a[keep])])
+    planes = np.column_stack([normal, np.einsum("ij,ij->i", normal, vertices[faces[keep, 0]])])
     # Planes closer than 1e-4 rad and 1 um are one plane: hulls of boxes have two triangles a side.
     _, first = np.unique(np.round(planes / np.array([1e-4, 1e-4, 1e-4, 1e-6])), axis=0, return_index=True)
     return planes[np.sort(first)]
@@ -137,7 +135,7 @@ class DeviceObject:
     def create(cls, obj: ObjectModel, device: str, *, samples: Floats, phong_alpha: float, cell: float) -> DeviceObject:
         """Upload an object with `samples` (S, 3) of its surface, object frame [m].
         `phong_alpha` is 0 for flat faces, 1 for full Phong projection. `cell` is the cell size of the distance grid
-        [m]; with 0 there is no grid, and all distances are computed from the mesh."""
+        [m]; with 0 there is no grid."""
         with wp.ScopedDevice(device):
             points = wp.array(obj.vertices - obj.centre_of_mass, dtype=wp.vec3)
             mesh = wp.Mesh(points=points, indices=wp.array(obj.faces.ravel(), dtype=wp.int32))
@@ -152,18 +150,10 @@ class DeviceObject:
                 add_grid(skin, obj, mesh, cell)
             centred = wp.array(samples - obj.centre_of_mass, dtype=wp.vec3)
             cells = sorted_samples(samples - obj.centre_of_mass)
-        return cls(
-            model=obj,
-            device=device,
-            surface=skin,
-            mesh=mesh,
-            samples=centred,
-            bvh=wp.Bvh(centred, centred),
-            sorted_samples=cells,
-        )
+        return cls(obj, device, skin, mesh, centred, wp.Bvh(centred, centred), cells)
 
     def thinned(self, count: int) -> DeviceObject:
-        """Return the object with its first `count` samples; farthest-point order keeps them evenly spread."""
+        """Return the object with its first `count` samples, which are evenly spread."""
         if count >= len(self.samples):
             return self
         with wp.ScopedDevice(self.device):
@@ -214,21 +204,25 @@ def chain_of(hand: HandModel, device: str) -> Any:
     """Return the hand on a device as `kernels.chain.Chain`, cached in memory."""
     # Loading here prevents threads from compiling the same module at once.
     wp.load_module(module=kernels, device=device)
-    with wp.ScopedDevice(device):
-        return _chain(hand)
-
-
-def _chain(hand: HandModel) -> Any:
     out, features = kernels.Chain(), hand.features
     joint = np.zeros(hand.bodies, np.int32)
     joint[hand.joint_body] = np.arange(len(hand.joint_body))
     order = np.argsort(features.body, kind="stable")
-    _add_joints(out, hand, wp.vec3d, wp.quatd, wp.float64)
-    out.joint = wp.array(joint, dtype=wp.int32)
-    out.turns = wp.array(hand.joint_type == JointType.REVOLUTE, dtype=wp.int32)
-    out.tip = wp.array(np.isin(np.arange(hand.bodies), hand.fingertips), dtype=wp.int32)
-    out.first = wp.array(np.searchsorted(features.body[order], np.arange(hand.bodies + 1)), dtype=wp.int32)
-    out.centre = wp.array(features.centre[order], dtype=wp.vec3d)
-    out.about = wp.array(features.axis[order], dtype=wp.vec3d)
-    out.radius = wp.array(features.radius[order], dtype=wp.float64)
+    with wp.ScopedDevice(device):
+        _add_joints(out, hand, wp.vec3d, wp.quatd, wp.float64)
+        out.joint = wp.array(joint, dtype=wp.int32)
+        out.turns = wp.array(hand.joint_type == JointType.REVOLUTE, dtype=wp.int32)
+        out.tip = wp.array(np.isin(np.arange(hand.bodies), hand.fingertips), dtype=wp.int32)
+        out.first = wp.array(np.searchsorted(features.body[order], np.arange(hand.bodies + 1)), dtype=wp.int32)
+        out.centre = wp.array(features.centre[order], dtype=wp.vec3d)
+        out.about = wp.array(features.axis[order], dtype=wp.vec3d)
+        out.radius = wp.array(features.radius[order], dtype=wp.float64)
     return out
+
+
+def bounding_ball(points: Floats) -> tuple[Floats, float]:
+    """Return centre and radius [m] of a ball around points (N, 3) and their box; zeros without points."""
+    if not len(points):
+        return np.zeros(3), 0.0
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())

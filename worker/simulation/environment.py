@@ -1,12 +1,12 @@
 """Environment of an object: the convex obstacles of a scene that a hand must avoid.
 
-An obstacle is an intersection of half-spaces: one for a table top, six for a board or a wall. A neighbour's convex
-piece has one per face of its hull. An `Environment` is in the object frame, `Scenes` are in the scene frame."""
+An obstacle is an intersection of half-spaces: one for a table top, six for a board or wall, and one per face for a
+neighbour's convex piece. An `Environment` is in the object frame, `Scenes` are in the scene frame."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
@@ -33,15 +33,12 @@ class Obstacle:
 
     planes: Floats  # (K, 4) outward unit normal and offset [m]
     corners: Floats  # (V, 3) corners [m]; none for an unbounded body such as a half-space
-    edges: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
-    """(E, 2) indices of corners that an edge connects."""
-    tips_m: float | None = None
-    """Clearance of fingertips [m], negative if they may press into the body; None for that of the hand."""
+    edges: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))  # (E, 2) corners of each edge
+    tips_m: float | None = None  # clearance of fingertips [m], below 0 if they may press; None for that of the hand
 
     @classmethod
     def half_space(cls, normal: Sequence[float] | Floats, offset: float) -> Obstacle:
-        """Return the half-space n.x <= offset; the normal need not have unit length.
-        Raises InputError: the normal is zero, or a number is not finite."""
+        """Return the half-space n.x <= offset, for any length of n. Raises InputError: zero or not finite."""
         n = np.asarray(normal, float)
         length = float(np.linalg.norm(n))
         if n.shape != (3,) or not np.isfinite(n).all() or not np.isfinite(offset) or length < 1e-9:
@@ -105,8 +102,7 @@ class Scenes:
     supports: tuple[Obstacle, ...]  # tables, boards and walls in the scene frame, z up
     object_pose: Floats  # (S, 7) of the object in the scene frame
     neighbours: tuple[Neighbour, ...] = ()
-    neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))
-    """(S, M, 7) of the neighbours in the scene frame."""
+    neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))  # (S, M, 7) in the scene frame
 
     def centred(self, obj: ObjectModel) -> Scenes:
         """Return the scenes with the frames of the object `obj` and of all neighbours moved to their centres."""
@@ -130,15 +126,14 @@ class PlacedGrasps:
     object_pose: Floats  # (S, 7) of the object in the scene frame
     index: NDArray[np.intp]  # (N,) scene of each grasp
     neighbours: tuple[Neighbour, ...] = ()
-    neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))
-    """(S, M, 7) of the neighbours in the scene frame."""
+    neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))  # (S, M, 7) in the scene frame
 
     @cached_property
     def scenes(self) -> tuple[Environment, ...]:
         """The S scenes in the object frame."""
         return tuple(
             Environment(
-                tuple(o.in_frame(pose) for o in self.supports) + self._neighbour_obstacles(number),
+                (*(o.in_frame(pose) for o in self.supports), *self._neighbour_obstacles(number)),
                 quat_rotate(quat_conjugate(pose[3:]), UP),
             )
             for number, pose in enumerate(np.asarray(self.object_pose, float))
@@ -147,13 +142,13 @@ class PlacedGrasps:
     @cached_property
     def fixed(self) -> str:
         """Digest of what all grasps have in common: supports and neighbours, without poses of objects."""
-        told = hashlib.sha256()
+        digest = hashlib.sha256()
         solids = [solid for one in self.neighbours for solid in one.solids]
         for body in (*self.supports, *solids):
-            told.update(f"{body.planes.shape} {body.corners.shape} {body.tips_m} ".encode())
-            told.update(body.planes.tobytes() + body.corners.tobytes())
-        told.update(" ".join(one.obj.content for one in self.neighbours).encode())
-        return told.hexdigest()
+            digest.update(f"{body.planes.shape} {body.corners.shape} {body.tips_m} ".encode())
+            digest.update(body.planes.tobytes() + body.corners.tobytes())
+        digest.update(" ".join(one.obj.content for one in self.neighbours).encode())
+        return digest.hexdigest()
 
     @property
     def everywhere(self) -> Scenes:
@@ -164,16 +159,14 @@ class PlacedGrasps:
         return self.everywhere.centred(obj).placed(self.index)
 
     def neighbours_of(self, scene: int) -> Floats:
-        """Return poses (M, 7) of the neighbours in the object frame."""
+        """Return poses (M, 7) of the neighbours in the object frame of a scene."""
         if not self.neighbours:
             return np.zeros((0, 7))
         return np.asarray(compose(invert(self.object_pose[scene]), np.asarray(self.neighbour_pose[scene], float)))
 
-    def _neighbour_obstacles(self, scene: int) -> tuple[Obstacle, ...]:
-        poses = self.neighbours_of(scene)
-        return tuple(
-            solid.moved(pose) for one, pose in zip(self.neighbours, poses, strict=True) for solid in one.solids
-        )
+    def _neighbour_obstacles(self, scene: int) -> Iterator[Obstacle]:
+        for neighbour, pose in zip(self.neighbours, self.neighbours_of(scene), strict=True):
+            yield from (solid.moved(pose) for solid in neighbour.solids)
 
     def take(self, rows: NDArray[np.intp] | slice) -> PlacedGrasps:
         taken = replace(self, index=self.index[rows])

@@ -1,7 +1,7 @@
-"""Distance grid of an object, and lists of the faces near each cell; both are cached on disk.
+"""Distance grid of an object, and lists of the faces near each cell.
 
-Both depend on the object, the cell size and `phong_alpha`, not on the hand. They take a fifth of the time until a
-process's first grasp, so later processes on a CPU read a file. A GPU computes them faster than a file is read."""
+They depend on the object, the cell size and `phong_alpha`, not on the hand. Processes on a CPU cache them on disk,
+since they take a fifth of the time until a first grasp. A GPU computes them faster than a file is read."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.engines.backend import binary_name
 from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.topology import edge_faces, face_vectors
 from graspd.worker.simulation.kernels import nearest, surface
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -105,18 +106,16 @@ def faces_of(obj: ObjectModel) -> Any:
 
 def feature_normals(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats:
     """Return unnormalised angle-weighted normals (F, 7, 3): inside, edges ab, bc, ca, corners a, b, c.
-    Vertices at the same place count as one. Faces without an area are ignored."""
+    Vertices at the same place count as one; faces without an area are ignored."""
     places, same = np.unique(vertices, axis=0, return_inverse=True)
     faces = same.reshape(-1)[faces]
     corner = places[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = face_vectors(places, faces)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = np.divide(normal, length, out=np.zeros_like(normal), where=length > 1e-14)
     out = np.empty((len(faces), nearest.FEATURES, 3))
     out[:, 0] = normal
-    ends = np.stack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]], axis=1)
-    _, edge = np.unique(np.sort(ends, axis=2).reshape(-1, 2), axis=0, return_inverse=True)
-    edge = edge.reshape(-1)
+    edge = edge_faces(faces.astype(np.int64))[0].reshape(3, -1).T.reshape(-1)
     out[:, 1:4] = _summed(edge, np.repeat(normal, 3, axis=0)).reshape(-1, 3, 3)
     side = np.roll(corner, -1, axis=1) - corner
     side /= np.maximum(np.linalg.norm(side, axis=2, keepdims=True), 1e-30)
@@ -126,15 +125,14 @@ def feature_normals(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats
 
 
 def _summed(group: NDArray[np.integer[Any]], rows: Floats) -> Floats:
-    """Return the sum of each row's group, for all rows (R, 3)."""
+    """Return the sum (R, 3) of each row's group."""
     total = np.zeros((int(group.max(initial=0)) + 1, 3))
     np.add.at(total, group, rows)
     return total[group]
 
 
 def list_cells(faces: Any, mesh: Any, field: Any, low: Any, size: float, within: float) -> Any:
-    """Return `nearest.Cells` of `faces`, for grid cells closer to the surface than `within` [m].
-    `low` is the first corner of the grid `field`."""
+    """Return `nearest.Cells`: lists for cells of grid `field`, first corner `low`, within `within` [m]."""
     cells = nearest.Cells()
     cells.faces = faces
     shape = [n - 1 for n in field.shape]

@@ -42,16 +42,15 @@ class Launches:
                     for call in self._calls:
                         call()
             return
+        launch_all: Callable[[], object] = self._launch_all
         if times > 2:
             if self._graph is None:
                 with wp.ScopedCapture(device=self.device) as capture:
                     self._launch_all()
                 self._graph = capture.graph
-            for _ in range(times):
-                wp.capture_launch(self._graph)
-            return
+            launch_all = partial(wp.capture_launch, self._graph)
         for _ in range(times):
-            self._launch_all()
+            launch_all()
 
     def _launch_all(self) -> None:
         for _, command in self._commands:
@@ -94,8 +93,7 @@ def _counted() -> Iterator[None]:
 
 def _packed(command: Any) -> Callable[[], object]:
     """Return a function that runs a recorded launch, on the CPU with arguments that are packed in advance.
-    Warp packs them at each launch while it holds the interpreter's lock. For a few hands, other threads then wait a
-    twentieth of each iteration."""
+    Warp would pack them at each launch under the interpreter's lock, and other threads would wait."""
     if not command.device.is_cpu or command.adjoint or command.block_dim > 1:
         return partial(command.launch)
     bounds, *values = command.params

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +15,7 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.hands.digits import points_of_parts
 from graspd.worker.hands.model import HandModel, SurfacePoints
 from graspd.worker.objects.region import WHOLE, ContactRegion
-from graspd.worker.simulation.device import DeviceHand, DeviceObject
+from graspd.worker.simulation.device import DeviceHand, DeviceObject, bounding_ball
 from graspd.worker.simulation.kernels import contact, pieces, surface
 from graspd.worker.simulation.obstacles import DeviceObstacles
 
@@ -175,17 +176,13 @@ def body_points(points: SurfacePoints, bodies: int) -> Any:
     order = np.argsort(points.body, kind="stable")
     body, position = points.body[order], points.position[order]
     first = np.searchsorted(body, np.arange(bodies + 1))
-    centre, radius, extent = np.zeros((bodies, 3)), np.zeros(bodies), np.zeros(bodies)
-    for k in range(bodies):
-        own = position[first[k] : first[k + 1]]
-        if len(own):
-            centre[k] = (own.min(axis=0) + own.max(axis=0)) / 2
-            radius[k] = np.linalg.norm(own - centre[k], axis=1).max()
-            extent[k] = np.linalg.norm(own, axis=1).max()
+    own = [position[start:end] for start, end in pairwise(first)]
+    centre, radius = zip(*map(bounding_ball, own), strict=True)
+    extent = [np.linalg.norm(points, axis=1).max(initial=0.0) for points in own]
     out = pieces.BodyPoints()
     out.first = wp.array(first, dtype=wp.int32)
     out.position = wp.array(position, dtype=wp.vec3)
-    out.centre = wp.array(centre, dtype=wp.vec3)
+    out.centre = wp.array(np.array(centre), dtype=wp.vec3)
     out.radius = wp.array(radius, dtype=wp.float32)
     out.extent = wp.array(extent, dtype=wp.float32)
     return out
@@ -199,12 +196,9 @@ def _physics(obj: DeviceObject, options: LossOptions) -> Any:
     physics.mass = contact.mat66(*mass.ravel().tolist())
     physics.inverse_mass = contact.mat66(*np.linalg.inv(mass).ravel().tolist())
     physics.gyration = obj.model.gyration_radius
-    physics.friction = options.friction
-    physics.stiffness = options.stiffness
-    physics.leak = options.leak
-    physics.leak_length = options.leak_length
+    for name in ("friction", "stiffness", "leak", "leak_length", "step"):
+        setattr(physics, name, getattr(options, name))
     physics.one_sided = int(options.one_sided)
-    physics.step = options.step
     physics.near_gap = NEAR_GAP
     physics.radius = obj.model.radius + options.band + MAX_DILATION
     return physics

@@ -120,11 +120,9 @@ def points_of(mounting: HandModel) -> Floats:
 def wrist_clearance(
     mounting: HandModel, poses: Floats, wrist: Floats, scenes: Sequence[Environment], which: NDArray[np.integer[Any]]
 ) -> Floats:
-    """Return the least clearance (N,) of mountings at root poses (N, P, 7) and wrist angles (N, K) [m].
-    Obstacles are those of scenes `which` (N,)."""
+    """Return the least clearance (N,) [m] in scenes `which`, over root poses (N, P, 7), at wrists (N, K)."""
     steps = poses.shape[1]
     joints = np.repeat(mounting.expand(wrist), steps, axis=0)
     postures = Posture(poses.reshape(-1, 7), joints)
-    return (
-        obstacle_clearance(mounting, postures, scenes, np.repeat(which, steps)).reshape(len(poses), steps).min(axis=1)
-    )
+    clearance = obstacle_clearance(mounting, postures, scenes, np.repeat(which, steps))
+    return clearance.reshape(len(poses), steps).min(axis=1)

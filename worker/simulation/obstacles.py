@@ -16,9 +16,10 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.primitives import HandFeatures
 from graspd.worker.objects.memory_cache import cached_by_content
-from graspd.worker.simulation.device import DeviceHand, chain_of, posed_bodies, to_xyzw
+from graspd.worker.simulation.device import DeviceHand, bounding_ball, chain_of, posed_bodies, to_xyzw
 from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle
 from graspd.worker.simulation.kernels import chain as chain_kernels
+from graspd.worker.simulation.kernels import kinematics
 from graspd.worker.simulation.kernels import obstacles as kernels
 from graspd.worker.simulation.kernels import solids as solid_kernels
 from graspd.worker.simulation.launches import launch
@@ -59,10 +60,11 @@ def _solid_distances(hand: HandModel, postures: Posture, scene: Environment) -> 
     device = _device_hand(hand)
     obstacles = DeviceObstacles.create(hand, [scene], np.zeros(3), "cpu")
     with wp.ScopedDevice("cpu"):
-        position: Any = wp.array(bodies[..., :3], dtype=wp.vec3)
-        rotation: Any = wp.array(to_xyzw(bodies[..., 3:]), dtype=wp.quat)
+        hands = kinematics.Hands()
+        hands.body_p = wp.array(bodies[..., :3], dtype=wp.vec3)
+        hands.body_q = wp.array(to_xyzw(bodies[..., 3:]), dtype=wp.quat)
         least = wp.full((len(bodies), hand.bodies), FAR_M, dtype=wp.float32)
-        inputs = [obstacles.features, device.pieces, obstacles.solids, position, rotation, FAR_M]
+        inputs = [obstacles.features, device.pieces, obstacles.solids, hands, FAR_M]
         launch(solid_kernels.distances, (len(bodies), len(hand.pieces)), inputs=inputs, outputs=[least], device="cpu")
     return least.numpy().astype(float)
 
@@ -78,10 +80,10 @@ def body_clearance(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> Floats:
     """Return signed distances (P, L) of the hand's bodies from the nearest obstacle [m]; inf if none.
-    Posture i is in the scene `which[i]`, by default in the first one. Fingertips may be closer to some supports than
-    `CLEAR_M`. Their distance from such a support is increased by the difference, so a hand is clear if no distance is
-    below `CLEAR_M`. Distances are exact from half-spaces, and from solids that the hand does not penetrate. Near edges
-    and corners of solids, distances of links with hulls are lower bounds. Distances from solids are at most `FAR_M`."""
+    Posture i is in the scene `which[i]`, by default in the first one. A hand is clear if no distance is below
+    `CLEAR_M`: where fingertips may be closer to a support, their distance is increased by the difference. Distances are
+    exact from half-spaces, and from solids that the hand does not penetrate; near edges and corners of solids, those of
+    links with hulls are lower bounds. Distances from solids are at most `FAR_M`."""
     which = np.zeros(len(postures), np.int32) if which is None else np.asarray(which, np.int32)
     out = _half_space_clearance(hand, postures, scenes, which)
     tips = np.isin(np.arange(hand.bodies), hand.fingertips)
@@ -105,7 +107,7 @@ def _half_space_clearance(
     flat, count = [o for one in every for o in one], len(postures)
     bodies, spaces = posed_bodies(hand, postures.hand_pose, postures.joint_positions), chain_kernels.HalfSpaces()
     with wp.ScopedDevice("cpu"):
-        spaces.first = wp.array(_starts([len(one) for one in every]), dtype=wp.int32)
+        spaces.first = wp.array(np.cumsum([0, *map(len, every)]), dtype=wp.int32)
         spaces.planes = wp.array(np.concatenate([np.zeros((0, 4)), *(o.planes for o in flat)]), dtype=wp.vec4d)
         spaces.more = wp.array([_extra_margin(o) for o in flat], dtype=wp.float64)
         room = wp.full((count, hand.bodies), np.inf, dtype=wp.float64)
@@ -139,8 +141,8 @@ class DeviceObstacles:
         *,
         margin: float | Floats = MARGIN_M,
     ) -> DeviceObstacles:
-        """Upload obstacles in the object frame.
-        `centre` (3,) is the object's centre of mass. `margin` is the clearance of features [m], or (L,) per body."""
+        """Upload obstacles in the object frame, in which `centre` (3,) is the centre of mass.
+        `margin` is the clearance of features [m], or (L,) per body."""
         found = hand.features
         kept = np.broadcast_to(np.asarray(margin, float), hand.bodies)[found.body]
         sorted_ = [sorted(scene.obstacles, key=lambda o: len(o.corners) > 0) for scene in scenes]
@@ -165,36 +167,24 @@ class DeviceObstacles:
             features.end = wp.array(found.edges[:, 1], dtype=wp.vec3)
             features.thickness = wp.array(found.thickness, dtype=wp.float32)
             solids = kernels.Obstacles()
-            first = _starts([len(one) for one in sorted_])
+            first = np.cumsum([0, *map(len, sorted_)])
             solids.first = wp.array(first, dtype=wp.int32)
-            solids.first_solid = wp.array(first[:-1] + np.array(endless, np.int32), dtype=wp.int32)
-            solids.first_plane = wp.array(_starts([len(o.planes) for o in obstacles]), dtype=wp.int32)
+            solids.first_solid = wp.array(first[:-1] + np.array(endless, int), dtype=wp.int32)
+            solids.first_plane = wp.array(np.cumsum([0, *(len(o.planes) for o in obstacles)]), dtype=wp.int32)
             solids.planes = wp.array(planes, dtype=wp.vec4)
             solids.tips = wp.array([FAR_M if o.tips_m is None else o.tips_m for o in obstacles], dtype=wp.float32)
-            spheres = [_sphere(o.corners - centre) for o in obstacles]
+            spheres = [bounding_ball(o.corners - centre) for o in obstacles]
             solids.centre = wp.array(np.array([s[0] for s in spheres]).reshape(-1, 3), dtype=wp.vec3)
             solids.radius = wp.array(np.array([s[1] for s in spheres]), dtype=wp.float32)
             edges = np.concatenate([np.zeros((0, 2, 3)), *(o.corners[o.edges] for o in obstacles)]) - centre
-            solids.first_edge = wp.array(_starts([len(o.edges) for o in obstacles]), dtype=wp.int32)
+            solids.first_edge = wp.array(np.cumsum([0, *(len(o.edges) for o in obstacles)]), dtype=wp.int32)
             solids.start, solids.end = (wp.array(edges[:, k], dtype=wp.vec3) for k in (0, 1))
         return cls(features, solids, any(len(o.corners) for o in obstacles))
-
-
-def _starts(lengths: Sequence[int]) -> NDArray[np.int32]:
-    return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
 
 
 def _feature_ball(features: HandFeatures, piece: int) -> tuple[Floats, float]:
     """Return centre (body frame) and radius [m] of a ball around the features of a piece."""
     rows = slice(features.first[piece], features.first[piece + 1])
-    middle, radius = _sphere(features.centre[rows])
+    middle, radius = bounding_ball(features.centre[rows])
     # Slightly larger, since kernels round.
     return middle, radius + float(features.radius[rows].max(initial=0.0)) + 1e-6
-
-
-def _sphere(corners: Floats) -> tuple[Floats, float]:
-    """Return centre and radius [m] of a bounding sphere; radius 0 for no corners."""
-    if not len(corners):
-        return np.zeros(3), 0.0
-    centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
-    return centre, float(np.linalg.norm(corners - centre, axis=1).max())

@@ -45,18 +45,15 @@ class ProjectionOptions:
 def _residuals(capacity: int) -> Any:
     out = kernels.Residuals()
     out.count = wp.zeros(capacity, dtype=wp.int32)
-    for name in ("body", "other"):
-        setattr(out, name, wp.empty((capacity, CAPACITY), dtype=wp.int32))
-    for name in ("point", "direction"):
-        setattr(out, name, wp.empty((capacity, CAPACITY), dtype=wp.vec3))
-    for name in ("value", "weight"):
-        setattr(out, name, wp.empty((capacity, CAPACITY), dtype=wp.float32))
+    shape = (capacity, CAPACITY)
+    out.body, out.other = (wp.empty(shape, dtype=wp.int32) for _ in range(2))
+    out.point, out.direction = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
+    out.value, out.weight = (wp.empty(shape, dtype=wp.float32) for _ in range(2))
     return out
 
 
 class Projection:
-    """Projection of a model's hands, which selects the least penetrating state of each.
-    No data leaves the device between two steps."""
+    """Projection of a model's hands that selects the least penetrating state of each on the device."""
 
     def __init__(self, model: Model, data: Data, options: ProjectionOptions) -> None:
         self.model, self.data, self.options = model, data, options
@@ -86,7 +83,10 @@ class Projection:
         self._add_step(step, now)
         step.run(iterations)
         self._validated(now, best).run()
-        return self._found(best, n), self._depth.numpy()[:n].copy()
+        pivot, rotation, q = (array.numpy()[:n].copy() for array in (best.pivot, best.rotation, best.q))
+        # A hand that no step improved has its rotation as given, in single precision.
+        rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+        return HandState(pivot, to_wxyz(rotation), q), self._depth.numpy()[:n].copy()
 
     def _validated(self, now: Any, best: Any) -> Launches:
         d, o = self.data, self.options
@@ -104,12 +104,6 @@ class Projection:
             out.rotation = wp.array(np.pad(to_xyzw(state.rotation), ((0, rest), (0, 0))), dtype=wp.quatd)
             out.q = wp.array(np.pad(state.q, ((0, rest), (0, 0))), dtype=wp.float64)
         return out
-
-    @staticmethod
-    def _found(states: Any, n: int) -> HandState:
-        pivot, rotation, q = (array.numpy()[:n].copy() for array in (states.pivot, states.rotation, states.q))
-        # A hand that no step improved has its rotation as given, in single precision.
-        return HandState(pivot, to_wxyz(rotation / np.linalg.norm(rotation, axis=1, keepdims=True)), q)
 
     def _add_equations(self, out: Launches) -> None:
         m, d, o, outputs = self.model, self.data, self.options, [self.residuals]

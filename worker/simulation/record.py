@@ -27,7 +27,7 @@ OPTIMIZERS: Final = ("adam", "gd")
 
 def record_placement(m: Model, d: Data, *, room: float = 0.0, within: float | None = None) -> Launches:
     """Record contacts and penetration depths only; `room` is added to each feature's margin [m].
-    `within`: contacts need to be exact only up to this distance [m]; depths do not depend on it."""
+    Contacts are exact only up to the distance `within` [m], if given; depths do not depend on it."""
     out = Launches(m.device)
     add_poses(out, m, d)
     add_distances(out, m, d, within=within)
@@ -47,9 +47,8 @@ def record_evaluation(m: Model, d: Data) -> Launches:
 
 
 def record_iteration(m: Model, d: Data, optimizer: str, *, patience: int = 0) -> Launches:
-    """Record one iteration: gradient and step.
-    If `patience` is above 0, a grasp without improvement for this many iterations is switched off.
-    Raises InputError: unknown optimizer."""
+    """Record one iteration: gradient and step. Raises InputError: unknown optimizer.
+    If `patience` is above 0, a grasp without improvement for this many iterations is switched off."""
     out = record_evaluation(m, d)
     add_step(out, m, d, optimizer, patience=patience)
     return out

@@ -69,8 +69,7 @@ def direct(contacts: Contacts, s0: Floats, world: World, passes: int = 60) -> Fl
 
 
 def gauss_seidel(contacts: Contacts, s0: Floats, world: World) -> tuple[Floats, Floats]:
-    """Return motions (..., 6) after one sweep of position-based dynamics with Coulomb friction.
-    Also return the impulses (..., N, 2) of each contact, normal and tangential."""
+    """Return motions (..., 6), and impulses (..., N, 2), normal and tangential, after one sweep."""
     s = s0
     impulses = []
     for i, (p, n) in enumerate(zip(contacts.points, contacts.normals, strict=True)):

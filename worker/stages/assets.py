@@ -7,6 +7,7 @@ import threading
 import zipfile
 from collections.abc import Callable, Hashable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,18 +77,16 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
 
 def neighbours_of(store: Store, message: TaskMessage) -> list[ObjectModel]:
     """Load the other objects in the scenes of a task, in the order of its request."""
-    return [_neighbour(store, one.object, one.digest or "") for one in message.request.beside]
 
-
-def _neighbour(store: Store, name: str, digest: str) -> ObjectModel:
-    def load() -> ObjectModel:
+    def load(name: str, digest: str) -> ObjectModel:
         obj = prepared_object(store, digest, name=name, face_error_m=NEIGHBOUR_FACE_ERROR_M)
         publish_model(store, AssetKind.OBJECT, obj)
         with suppress(MeshError):  # without pieces, the object's hull is the obstacle
             pieces_of(store, obj)
         return obj
 
-    return _cached((store.url, "neighbour", name, digest), load)
+    beside = [(one.object, one.digest or "") for one in message.request.beside]
+    return [_cached((store.url, "neighbour", *key), partial(load, *key)) for key in beside]
 
 
 def cache_network(store: Store, message: TaskMessage) -> None:

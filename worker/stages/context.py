@@ -52,8 +52,7 @@ class TaskContext:
         """`join`: number of batches planned in one launch; `tell`: receives done, total and a message."""
         self.store, self.device, self.join = store, run.device, join
         self.run = replace(run, progress=self.progress, cancelled=self.cancelled)  # execution context for the engine
-        self._tell = tell
-        self._tell_again = 0.0
+        self._tell, self._tell_again = tell, 0.0
         self._stop = threading.Event()
         self.stop_reason: StopReason | None = None
 
@@ -65,9 +64,11 @@ class TaskContext:
             self._tell(done, total, message)
 
     def cancelled(self) -> bool:
+        """Check whether the task should stop."""
         return self._stop.is_set()
 
     def check(self) -> None:
+        """Raise TaskCancelled if the task should stop."""
         if self._stop.is_set():
             raise TaskCancelled(f"stopped: {self.stop_reason}")
 
@@ -89,9 +90,8 @@ class Output:
 def shard_of(
     message: TaskMessage, output: Output, *, device: str, seconds: float, worker: str, lost: ShardManifest | None = None
 ) -> tuple[ShardManifest, bytes]:
-    """Build the shard of a stage: its manifest and its HDF5 bytes.
-    The new file keeps times and package version of `lost`, the manifest of the file that it replaces. Raises
-    InputError: the columns do not fit the schema."""
+    """Build a stage's manifest and HDF5 bytes. Raises InputError: the columns do not fit the schema.
+    A file that replaces a lost one keeps the times and package version of the manifest `lost`."""
     kind = SHARD_KINDS[message.stage]
     request = message.request
     attributes: dict[str, Attribute] = {
@@ -121,9 +121,8 @@ def shard_of(
 
 
 def batch_seed(message: TaskMessage) -> int:
-    """Compute the seed of this stage for this batch.
-    Batches, hands and objects must not repeat each other's materials, lamps and cameras. Methods share them: with
-    identical pictures, networks trained on grasps of two methods can be compared."""
+    """Compute the seed of this stage for this batch of a hand and an object.
+    Methods share it: networks trained on grasps of two methods see the same pictures."""
     pair = [message.hand_digest, message.object_digest]
     return int(digest_json([message.request.seed, message.stage, message.batch, *pair])[:8], 16) % 2**31
 

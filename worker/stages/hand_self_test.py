@@ -61,8 +61,7 @@ class BestGrasp:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """Result of the test; `gsr` is the share of candidates that hold at level standard.
-    `table` is the share of the `table_n` grasps on a table that lift the object."""
+    """Shares `gsr` of n free grasps that hold, and `table` of `table_n` grasps on a table that lift."""
 
     gsr: float
     n: int
@@ -111,8 +110,7 @@ def failed_facts(reason: str, says: str = "suspicious") -> dict[str, Any]:
 
 
 def self_test_facts(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Any]:
-    """Return the facts of a self-test; the facts report an error of the test instead of raising it.
-    Raises TaskCancelled: `run.cancelled()` returned True."""
+    """Return the facts of a self-test, also of one that ended with an error. Raises TaskCancelled."""
     try:
         return self_test(hand(), run).facts()
     except InputError as error:
@@ -125,9 +123,9 @@ def self_test_facts(hand: Callable[[], HandModel], run: ExecutionContext = DEFAU
 def self_test(
     hand: HandModel, run: ExecutionContext = DEFAULT_CONTEXT, *, grasps: int = GRASPS, on_table: int = TABLE_GRASPS
 ) -> SelfTest:
-    """Test grasps of a sphere, a box and a cylinder with the defaults of `JobOptions`, in equal numbers.
-    Then test grasps of the same objects on a table. There is no time limit: a busy machine gives the same verdict.
-    Raises InputError: a hand finds no start around one of the objects. TaskCancelled."""
+    """Test grasps of a sphere, a box and a cylinder with the defaults of `JobOptions`, then on a table.
+    There is no time limit: a busy machine gives the same verdict. Raises InputError: a hand finds no start around one
+    of the objects. TaskCancelled."""
     width = fitting_width(hand)
     held: dict[str, list[bool]] = {}
     lost: list[bool] = []
@@ -183,10 +181,7 @@ def _drive_deflection(hand: HandModel) -> float:
 
 def _batches(hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext) -> list[ValidatedBatch]:
     sizes = [min(BATCH_SIZE, count - first) for first in range(0, count, BATCH_SIZE)]
-    return [
-        validated_grasps(hand, obj, _request(size), count=size, batch=batch, run=run)
-        for batch, size in enumerate(sizes)
-    ]
+    return [validated_grasps(hand, obj, _request(n), count=n, batch=batch, run=run) for batch, n in enumerate(sizes)]
 
 
 def _request(count: int) -> JobOptions:

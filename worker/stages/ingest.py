@@ -36,8 +36,7 @@ _OUT_OF_MEMORY: Final = ("MemoryError", "bad_alloc", "Cannot allocate", "failed 
 _FINDING_BYTES: Final = 2**20
 _MODEL: Final = "model.glb"
 _MODEL_BYTES: Final = 2**24
-#: CPU time of a check [s] above which the first task with the asset makes its 3D model.
-_MODEL_CPU_S: Final = 8.0
+_MODEL_CPU_S: Final = 8.0  # CPU time of a check [s] above which the first task with the asset makes its 3D model
 
 
 def run(message: IngestMessage, context: TaskContext) -> None:
@@ -84,18 +83,10 @@ def check_in_child(
         arguments = [kind.value, name, str(source), str(target), str(memory_bytes), str(cpu_s)]
         command = [sys.executable, "-m", "graspd.worker.stages.ingest", *arguments]
         # A file of limited size: a full pipe would block the child, and reading from a pipe has no limit.
-        with (
-            errors.open("wb") as stderr,
-            subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=stderr,
-                start_new_session=True,
-                env=_environment(),
-            ) as child,
-        ):
-            code = _wait(child, context)
+        with errors.open("wb") as stderr:
+            streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": stderr}
+            with subprocess.Popen(command, **streams, start_new_session=True, env=_environment()) as child:
+                code = _wait(child, context)
         complaint = errors.read_bytes()[-4000:].decode(errors="replace")
         if target.is_file() and target.stat().st_size > _FINDING_BYTES:
             why = f"the result of the check exceeds {_FINDING_BYTES >> 20} MiB; simplify it, or shorten its names"

@@ -2,10 +2,9 @@
 
 ``python -m graspd.worker.stages.models`` writes the models of built-in hands and objects to `service/builtin/models/`.
 
-Node `extras` contain the joint tree, so a viewer can pose the hand from the joint positions of a shard. A node's pose
-is parent * rest pose * motion about `axis`. Points of the hand's surface are POINTS primitives. For a body drawn with
-visual meshes, `extras` name the mesh of its collision shapes, which no node draws. The document's `extras` contain
-facts, link frames, joint drives and pads of the hand."""
+Node `extras` contain the joint tree: a node's pose is parent * rest pose * motion about `axis`. Points of the hand's
+surface are POINTS primitives. For a body drawn with visual meshes, `extras` name the mesh of its collision shapes,
+which no node draws. The document's `extras` contain facts, link frames, joint drives and pads of the hand."""
 
 from __future__ import annotations
 
@@ -34,9 +33,7 @@ from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object
 
-#: Tolerance of a displayed object [m]. It is the standard fidelity's tolerance, so that the display shows the grasped
-#: mesh.
-SHOWN_ERROR_M: Final = Fidelity().face_error_m
+SHOWN_ERROR_M: Final = Fidelity().face_error_m  # tolerance of a displayed object [m]: that of fidelity standard
 _BUILTIN: Final = Path(__file__).parents[2] / "service" / "builtin" / "models"
 
 
@@ -55,6 +52,7 @@ def publish_model(store: Store, kind: AssetKind, model: HandModel | ObjectModel)
 
 
 def write_builtins() -> None:
+    """Write the models of all built-in hands and objects."""
     _BUILTIN.mkdir(exist_ok=True)
     for kind in AssetKind:
         for name in builtin_names(kind):
@@ -72,7 +70,9 @@ def hand_glb(hand: HandModel) -> bytes:
     document = Document()
     points = sample_surface(hand, SURFACE_POINTS)
     nodes: list[dict[str, Any]] = []
-    visuals = _light_visuals(hand)
+    visuals = hand.visuals.meshes
+    if (excess := sum(len(mesh.faces) for mesh in visuals) / MAX_FACES) > 1:
+        visuals = tuple(thin_mesh(mesh, excess) for mesh in visuals)
     joint_of_body = dict(zip(hand.joint_body.tolist(), hand.joint_names, strict=True))
     for body in range(hand.bodies):
         node: dict[str, Any] = {"name": hand.body_names[body], "extras": {"fingertip": body in hand.fingertips}}
@@ -98,8 +98,7 @@ def hand_glb(hand: HandModel) -> bytes:
 
 
 def object_glb(obj: ObjectModel) -> bytes:
-    """Return the prepared mesh as glTF [m] in the object's own frame.
-    The node's translation is the middle of the mesh, since glTF coordinates have 32 bits."""
+    """Return the prepared mesh as glTF [m]; its node is translated to the middle, for 32-bit coordinates."""
     document = Document()
     primitive = document.add_triangles(obj.centred.vertices, obj.faces, obj.corner_normals)
     extras = {"kind": "object", "name": obj.name, "centre_of_mass": rounded_values(obj.centre_of_mass)}
@@ -108,20 +107,14 @@ def object_glb(obj: ObjectModel) -> bytes:
 
 
 def _found(hand: HandModel) -> dict[str, Any]:
-    drives = {
-        joint: {
-            "dof": hand.dof_names[hand.dof[body]],
-            "times": float(hand.multiplier[body]),
-            "plus": float(hand.offset[body]),
-        }
-        for body, joint in zip(hand.joint_body.tolist(), hand.joint_names, strict=True)
-    }
+    drives = {}
+    for body, joint in zip(hand.joint_body.tolist(), hand.joint_names, strict=True):
+        times, plus = float(hand.multiplier[body]), float(hand.offset[body])
+        drives[joint] = {"dof": hand.dof_names[hand.dof[body]], "times": times, "plus": plus}
     pads = []
     for pad in pads_of(hand):
-        few = pad.points[:: max(1, -(-len(pad.points) // PAD_POINTS))]
-        pads.append(
-            {"body": pad.body, "normal": rounded_values(pad.normal), "points": [rounded_values(point) for point in few]}
-        )
+        points = [rounded_values(point) for point in pad.points[:: max(1, -(-len(pad.points) // PAD_POINTS))]]
+        pads.append({"body": pad.body, "normal": rounded_values(pad.normal), "points": points})
     links = {link: {"body": body, "pose": rounded_values(pose)} for link, (body, pose) in hand.frames.items()}
     return {"facts": model_facts(hand), "links": links, "drives": drives, "pads": pads}
 
@@ -154,12 +147,6 @@ def _joined(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]
         np.concatenate([corner_normals(vertices, faces) for vertices, faces, _ in meshes]),
         face_colours=colours,
     )
-
-
-def _light_visuals(hand: HandModel) -> tuple[VisualMesh, ...]:
-    meshes = hand.visuals.meshes
-    excess = sum(len(mesh.faces) for mesh in meshes) / MAX_FACES
-    return meshes if excess <= 1 else tuple(thin_mesh(mesh, excess) for mesh in meshes)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ _OF_SOME: Final = {"quality/recheck": np.int8(-1)}
 
 
 def sizes_of(message: TaskMessage) -> list[int]:
+    """Return the number of grasps of each batch of a task."""
     return [min(BATCH_SIZE, message.count - first) for first in range(0, message.count, BATCH_SIZE)]
 
 
@@ -57,35 +58,35 @@ def join_outputs(message: TaskMessage, made: Sequence[Output], *, base_rows: Seq
         if first := firsts.get(path):
             rows = [numbers + start for numbers, start in zip(rows, first, strict=True)]
         columns[path] = np.concatenate(rows)
-    said = {**made[0].attributes}
+    attributes = {**made[0].attributes}
     if kind == "base":
-        said["batch_rows"] = json_attribute([len(part["grasp/hand_pose"]) for part in parts])
-    return Output(columns, said, _summed([output.info for output in made]))
+        attributes["batch_rows"] = json_attribute([len(part["grasp/hand_pose"]) for part in parts])
+    return Output(columns, attributes, _summed([output.info for output in made]))
 
 
 def base_rows(base: Shard, message: TaskMessage) -> list[range]:
     """Return each batch's rows in a task's base shard. Raises DamagedShard: the shard has other batches."""
-    said = base.attributes.get("batch_rows")
-    counts = [len(base.arrays["grasp/hand_pose"])] if said is None else json.loads(str(said))
+    stored = base.attributes.get("batch_rows")
+    counts = [len(base.arrays["grasp/hand_pose"])] if stored is None else json.loads(str(stored))
     if len(counts) != len(sizes_of(message)):
         raise DamagedShard(f"shard {message.inputs[0]} has {len(counts)} batches, not {len(sizes_of(message))}")
     return [range(start, start + count) for start, count in zip(_starts(counts), counts, strict=True)]
 
 
-def _summed(told: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _summed(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Combine the records of several batches.
-    Counts and seconds are summed. Shares are averaged, weighted with the numbers of planned grasps. Other
-    entries are those of the first batch."""
-    found = dict(told[0])
-    planned = [one.get("planned", 0) for one in told]
-    for name, value in told[0].items():
-        values = [one[name] for one in told if name in one]
+    Counts and seconds are summed, shares averaged with the planned grasps as weights; others are the first batch's."""
+    found = dict(records[0])
+    planned = [record.get("planned", 0) for record in records]
+    for name, value in records[0].items():
+        values = [record[name] for record in records if name in record]
         if name == "planned" or name.endswith("_seconds"):
             found[name] = round(sum(values), 4)
         elif name.endswith("_share"):
             found[name] = round(float(np.average(values, weights=np.maximum(planned, 1e-9))), 4)
         elif isinstance(value, dict) and all(isinstance(count, int) for count in value.values()):
-            found[name] = {key: sum(one.get(key, 0) for one in values) for key in {k: 0 for one in values for k in one}}
+            keys = dict.fromkeys(key for counts in values for key in counts)
+            found[name] = {key: sum(counts.get(key, 0) for counts in values) for key in keys}
     return found
 
 

@@ -28,15 +28,15 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     stage = Stage.SYNTHESIZE if request.in_scene else Stage.SCENE
     shard = load_input(message, context, stage)
     obj = object_of(context.store, message)
-    said: dict[str, Attribute] = {"scene_shard": message.inputs[0]}
+    attributes: dict[str, Attribute] = {"scene_shard": message.inputs[0]}
     extras = Extras(channels=request.channels)
     if request.in_scene:
         others = neighbours_of(context.store, message)
         beside = Neighbours(others, np.asarray(shard["scene/neighbour_pose"], float)) if others else None
         drawn = _select_drawn_hand(shard, message, context)
         extras = replace(extras, supports=supports_in(request.place), drawn=drawn, neighbours=beside)
-        said = {"base_shard": message.inputs[0], "scene": json_attribute(request.place.to_attribute())}
-        said |= neighbour_attributes(message)
+        attributes = {"base_shard": message.inputs[0], "scene": json_attribute(request.place.to_attribute())}
+        attributes |= neighbour_attributes(message)
     context.check()
     pictures = render(
         obj,
@@ -49,7 +49,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         run=context.run.part(0.0, 1.0),
         extras=extras,
     )
-    return Output(pictures, said)
+    return Output(pictures, attributes)
 
 
 def _select_drawn_hand(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand | None:
@@ -60,10 +60,5 @@ def _select_drawn_hand(base: Shard, message: TaskMessage, context: TaskContext) 
     if not len(among):
         return None
     poses = np.asarray(base["scene/object_pose"], float)
-    return DrawnHand(
-        hand,
-        rows,
-        compose(poses, np.asarray(base["grasp/hand_pose"], float)[rows]),
-        np.asarray(base["grasp/joint_positions"], float)[rows],
-        wrists_of(base, rows),
-    )
+    hand_poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
+    return DrawnHand(hand, rows, compose(poses, hand_poses), joints, wrists_of(base, rows))

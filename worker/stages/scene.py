@@ -35,16 +35,16 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     """Make the scenes of each batch."""
     parts = split_into_batches(message)
 
-    def told(number: int) -> TaskContext:
+    def reported(number: int) -> TaskContext:
         context.check()
         context.progress(number, len(parts), "scenes")
         return context
 
     if message.request.in_scene:
-        return join_outputs(message, [_make_scenes(part, told(number)) for number, part in enumerate(parts)])
+        return join_outputs(message, [_make_scenes(part, reported(number)) for number, part in enumerate(parts)])
     base = load_input(message, context, Stage.SYNTHESIZE)
     rows = base_rows(base, message)
-    made = [_transfer_to_scenes(part, told(number), base, rows[number]) for number, part in enumerate(parts)]
+    made = [_transfer_to_scenes(part, reported(number), base, rows[number]) for number, part in enumerate(parts)]
     return join_outputs(message, made, base_rows=rows)
 
 
@@ -61,12 +61,8 @@ def _make_scenes(message: TaskMessage, context: TaskContext) -> Output:
         _, scenes = scenes_of(place, obj, others, count=message.request.scenes, seed=seed)
     except MeshError as error:
         raise SceneError(str(error)) from None
-    said: dict[str, Attribute] = {
-        "scene": json_attribute(place.to_attribute()),
-        "root_link": hand.root_link,
-        **neighbour_attributes(message),
-    }
-    return Output({**scenes, **_NO_GRASPS}, said)
+    attributes: dict[str, Attribute] = {"scene": json_attribute(place.to_attribute()), "root_link": hand.root_link}
+    return Output({**scenes, **_NO_GRASPS}, attributes | neighbour_attributes(message))
 
 
 def _transfer_to_scenes(message: TaskMessage, context: TaskContext, base: Shard, rows: range) -> Output:

@@ -23,15 +23,7 @@ from graspd.worker.planners import NoStartFound, planner
 from graspd.worker.scenes.kinds import supports_of
 from graspd.worker.scenes.placement import neighbour_of
 from graspd.worker.simulation.environment import Scenes
-from graspd.worker.stages.assets import (
-    cache_network,
-    hand_of,
-    load_input,
-    neighbour_attributes,
-    neighbours_of,
-    object_of,
-    pieces_of,
-)
+from graspd.worker.stages import assets
 from graspd.worker.stages.context import Output, TaskContext
 from graspd.worker.stages.ranges import join_outputs, sizes_of
 
@@ -43,8 +35,8 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     """Plan and validate `message.count` grasps within the job's budget.
     Raises SceneError: the hand does not reach into the scenes, the method cannot plan in them, or the first batch finds
     no grasp. LoadError: a job's first batch finds none because the payload is far too small."""
-    hand, obj = hand_of(context.store, message), object_of(context.store, message)
-    cache_network(context.store, message)
+    hand, obj = assets.hand_of(context.store, message), assets.object_of(context.store, message)
+    assets.cache_network(context.store, message)
     columns = _scene_columns(message, context)
     scenes = [_scenes(message, part, context) for part in columns]
     context.check()
@@ -57,7 +49,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             first=message.batch,
             join=context.join,
             scenes=scenes or None,
-            pieces=lambda prepared: pieces_of(context.store, prepared),
+            pieces=lambda prepared: assets.pieces_of(context.store, prepared),
             run=context.run,
             checked=partial(_stop_if_empty, message, in_scenes=bool(scenes)),
             empty_on=(NoStartFound,) if scenes else (),
@@ -68,7 +60,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             raise SceneError(str(error)) from None
         raise
     made = [_output(one, part) for one, part in zip(found, columns or [{}] * len(found), strict=True)]
-    said = base_attributes(
+    attributes = base_attributes(
         hand,
         obj,
         message.request,
@@ -77,8 +69,9 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         outcomes=sum_outcomes(one.outcomes for one in found),
     )
     of_scenes: dict[str, Attribute] = {"scene_shard": message.inputs[0]} if scenes else {}
+    of_scenes |= assets.neighbour_attributes(message)
     whole = join_outputs(message, made)
-    return replace(whole, attributes={**whole.attributes, **said, **of_scenes, **neighbour_attributes(message)})
+    return replace(whole, attributes={**whole.attributes, **attributes, **of_scenes})
 
 
 def _output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Output:
@@ -97,7 +90,7 @@ def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str,
         planner(request.method, request.options, in_scenes=True)
     except InputError as error:
         raise SceneError(str(error)) from None
-    shard = load_input(message, context, Stage.SCENE)
+    shard = assets.load_input(message, context, Stage.SCENE)
     there = {name: np.asarray(shard[name], float) for name in _OF_SCENES if name in shard.arrays}
     count = len(sizes_of(message))
     parts = {name: np.split(column, count) for name, column in there.items()}
@@ -106,7 +99,7 @@ def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str,
 
 def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: TaskContext) -> Scenes:
     scenes = Scenes(supports_of(message.request.place), columns["scene/object_pose"])
-    if not (others := neighbours_of(context.store, message)):
+    if not (others := assets.neighbours_of(context.store, message)):
         return scenes
     beside = tuple(neighbour_of(other) for other in others)
     return replace(scenes, neighbours=beside, neighbour_pose=columns["scene/neighbour_pose"])

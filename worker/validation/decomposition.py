@@ -21,14 +21,8 @@ from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import MeshError
 from graspd.service.model.libraries import version_of
 from graspd.service.model.transforms import Floats
-from graspd.worker.objects.convex import (
-    WorkLimitExceeded,
-    coacd_parts,
-    default_cache,
-    load_parts,
-    save_parts,
-    union_volume,
-)
+from graspd.worker.objects import convex
+from graspd.worker.objects.convex import WorkLimitExceeded, union_volume
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.topology import face_areas
 
@@ -36,8 +30,7 @@ log = logging.getLogger(__name__)
 
 #: Pieces with at most this mean excess are good [m]: a smaller excess hardly changes verdicts.
 GOOD_EXCESS_M: Final = 8.5e-4
-#: Largest accepted mean excess [m].
-MAX_EXCESS_M: Final = 2e-3
+MAX_EXCESS_M: Final = 2e-3  # largest accepted mean excess [m]
 #: CoACD's concavity thresholds from coarse to fine; the first that gives good pieces is used.
 THRESHOLDS: Final = (0.1, 0.05, 0.03)
 MAX_PIECES: Final = 64
@@ -50,24 +43,18 @@ _COACD: Final = {
     "max_convex_hull": MAX_PIECES,
     "seed": 1,
 }
-#: CPU time limit of one CoACD run [s]; beyond it the coarser result is used and a warning is logged.
-CPU_S: Final = 300
-#: Pieces below this volume are splinters that MuJoCo cannot build [m^3].
-_MIN_VOLUME: Final = 1e-9
+CPU_S: Final = 300  # CPU time limit of one CoACD run [s]; beyond it the coarser result is used and a warning is logged
+_MIN_VOLUME: Final = 1e-9  # pieces below this volume are splinters that MuJoCo cannot build [m^3]
 
 
 @dataclass(frozen=True)
 class ConvexPieces:
     """Convex decomposition of an object."""
 
-    vertices: tuple[Floats, ...]
-    """One (V, 3) array of corners per piece, object frame [m]."""
-    volume_ratio: float
-    """Ratio of the union's volume to the object's volume."""
-    excess_m: float
-    """Mean height of the union above the object's surface [m]."""
-    digest: str
-    """Digest of the pieces' corners: part of a verdict's key."""
+    vertices: tuple[Floats, ...]  # one (V, 3) array of corners per piece, object frame [m]
+    volume_ratio: float  # ratio of the union's volume to the object's volume
+    excess_m: float  # mean height of the union above the object's surface [m]
+    digest: str  # digest of the pieces' corners: part of a verdict's key
 
     def __len__(self) -> int:
         return len(self.vertices)
@@ -103,15 +90,15 @@ def piece_file(obj: ObjectModel, cache: Path | None = None) -> Path:
     mesh = obj.centred
     shape = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
     settings = [_COACD, THRESHOLDS, GOOD_EXCESS_M, version_of("coacd")]
-    return (cache or default_cache()) / f"{digest_json({'shape': shape, 'settings': settings})}.npz"
+    return (cache or convex.default_cache()) / f"{digest_json({'shape': shape, 'settings': settings})}.npz"
 
 
 @cached(LRUCache(64), key=lambda _, file: file, condition=Condition())
 def _load_or_make(obj: ObjectModel, file: Path) -> ConvexPieces:
-    parts = load_parts(file) if file.is_file() else None
+    parts = convex.load_parts(file) if file.is_file() else None
     if parts is None:
         parts = _make(obj)
-        save_parts(file, parts)
+        convex.save_parts(file, parts)
     volume = union_volume(parts)
     digest = digest_json([hashlib.sha256(np.round(part, 9).tobytes()).hexdigest() for part in parts])
     return ConvexPieces(parts, volume / obj.volume, _excess(volume, obj), digest)
@@ -128,11 +115,10 @@ def _make(obj: ObjectModel) -> tuple[Floats, ...]:
         if excess <= GOOD_EXCESS_M:
             break
         try:
-            made = coacd_parts(obj.vertices, obj.faces, {"threshold": threshold, **_COACD}, CPU_S)
+            made = convex.coacd_parts(obj.vertices, obj.faces, {"threshold": threshold, **_COACD}, CPU_S)
         except WorkLimitExceeded as error:
-            log.warning(
-                "%s: more than %d pieces need %s; the coarser ones are used", obj.name or "an object", len(best), error
-            )
+            name = obj.name or "an object"
+            log.warning("%s: more than %d pieces need %s; the coarser ones are used", name, len(best), error)
             break
         parts = tuple(part for part in made if len(part) >= 4 and union_volume((part,)) > _MIN_VOLUME)
         found = _excess(union_volume(parts), obj)

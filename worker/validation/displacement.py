@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from graspd.service.model.transforms import Floats
-from graspd.worker.engines.mujoco_warnings import ARENA, is_invalid
+from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
@@ -22,7 +22,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
-from graspd.worker.validation.model import add_object, add_shape
+from graspd.worker.validation.model import add_object, add_shape, empty_spec
 
 MASS: Final = 1.0
 FRICTION: Final = 3.0
@@ -57,13 +57,7 @@ def simulated_displacement_cm(
 
 @cached_by_content(8)
 def _model(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces) -> Any:
-    spec = mujoco.MjSpec()
-    spec.compiler.degree = False
-    spec.memory = ARENA
-    spec.option.timestep = TIMESTEP_S
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10.0
+    spec = empty_spec(TIMESTEP_S)
     spec.option.gravity = [0, 0, -GRAVITY]
     friction = [FRICTION, 0.005, 1e-4]
     for b in range(hand.bodies):

@@ -36,25 +36,19 @@ class ForeignVerdicts:
         validation_hand: name of the other model. fingertips_mm: largest distance between fingertips of both models.
         foreign_key: terms of the verdicts in the other model."""
         a, b = self.nominal.success == 1, self.foreign.success == 1
+        held = {"both": a & b, "nominal": a & ~b, "foreign": ~a & b, "neither": ~a & ~b}
         return {
             "validation_hand": self.same.theirs.name,
             "fingertips_mm": round(1e3 * self.same.fingertips_m, 6),
             "foreign_key": self.foreign.terms,
-            **share_counts(
-                {
-                    "both": int((a & b).sum()),
-                    "nominal": int((a & ~b).sum()),
-                    "foreign": int((~a & b).sum()),
-                    "neither": int((~a & ~b).sum()),
-                }
-            ),
+            **share_counts({models: int(mask.sum()) for models, mask in held.items()}),
         }
 
 
 def share_counts(held: Mapping[str, int]) -> dict[str, Any]:
     """Return shares from numbers of grasps held in both models, one, or neither; None without grasps.
-    foreign_held: the counts. agreement: share of grasps with equal verdicts in both models. foreign_share: share of
-    nominally held grasps that hold in the other model. foreign_gsr: share of all grasps that hold in it."""
+    foreign_held: the counts. agreement: share with equal verdicts. foreign_share: share of nominally held grasps that
+    hold in the other model. foreign_gsr: share of all grasps that hold in it."""
     n, nominal = sum(held.values()), held["both"] + held["nominal"]
 
     def share(part: int, whole: int) -> float | None:
@@ -86,9 +80,9 @@ def foreign_verdicts(
 
 def with_drives_of(same: HandMatch) -> HandModel:
     """Return the other model with the gains and limits of `same.ours`.
-    Let a dof with gain k and limit e move n joints by m_i. Each joint then gets the gain k / (n m_i^2) and the limit e
-    / (n |m_i|). Conversely, a dof's gain and limit are sum(m_i^2 k_i) and sum(|m_i| e_i) of its joints. The drive along
-    the joints' common motion is thus the same in a model that couples them and in a model with a tendon."""
+    Joint i of the n joints of a dof with gain k and limit e, moved by m_i, gets the gain k / (n m_i^2) and the limit e
+    / (n |m_i|). Conversely, a dof has gain sum(m_i^2 k_i) and limit sum(|m_i| e_i). Coupled joints and tendons thus
+    have the same drive along their common motion."""
     ours, theirs = same.ours, same.theirs
     dof, rate = ours.dof[ours.joint_body], ours.multiplier[ours.joint_body]
     joints = np.bincount(dof, minlength=ours.dofs)[dof]

@@ -21,12 +21,10 @@ from graspd.worker.validation.decomposition import ConvexPieces
 
 Level = Literal["dexgraspbench", "standard", "fast"]
 
-#: Revision of the code of protocol and scene; increase it if code (not a constant) changes verdicts.
-REVISION: Final = 6
+REVISION: Final = 6  # revision of the code of protocol and scene; increase it if code (not a constant) changes verdicts
 
 _EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "AHEAD", "LOST_ROTATION")
-#: Constants that affect verdicts, by module; `LEVEL_MOVES` has constants that not all levels use. Other constants of
-#: these modules affect no verdict.
+#: All constants of these modules that affect verdicts; `LEVEL_MOVES` has those that not all levels use.
 MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
     protocol: ("DIRECTIONS", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S"),
     matter: ("ACCELERATION",),
@@ -71,9 +69,7 @@ def verdict_key(
     hand: HandModel, obj: ObjectModel, level: Level, hard: bool, *, pieces: ConvexPieces, prefilter: Sequence[Any] = ()
 ) -> str:
     """Return the digest of a verdict's terms: everything that determines it except the grasp's postures.
-    Terms are level, friction, masses, gains, torque limits, shapes of the hand, convex pieces of the object, and the
-    rules of pregrasp and squeeze. Further terms are the constants of `MOVES` and of the level, the version of the
-    engine, and `prefilter`: the prefilter's terms if it is used."""
+    `prefilter` has the prefilter's terms if it is used."""
     shapes = b"".join(np.round(p.vertices, 9).tobytes() + np.round(p.pose, 9).tobytes() for p in hand.pieces)
     return digest_json(
         {

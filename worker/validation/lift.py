@@ -1,11 +1,11 @@
 """The lift test: the object rests in its scene; the hand closes, squeezes, lifts and holds it.
 
-dexgraspbench: DexGraspBench's tabletop test as published. From the pregrasp on, the object's weight (published: 1 N)
-acts down. After the squeeze the hand rises 10 cm in 0.4 s, without a hold.
-lift: the hand starts at its standoff and must touch nothing on its approach. Fingertips may touch supports, or press
-into them as deep as the scene allows. The hand rises smoothly in 0.8 s and holds for 2 s, with early termination as at
-level standard. Neighbours are free bodies on the table; they must not move by 2 cm or topple.
-The world frame of the simulation is the object frame at rest; the scene is placed around it accordingly."""
+dexgraspbench: DexGraspBench's published tabletop test. From the pregrasp on, the object's weight acts down (published:
+1 N). After the squeeze the hand rises 10 cm in 0.4 s, without a hold.
+lift: the hand starts at its standoff and must touch nothing on its approach, except supports by fingertips as the scene
+allows. It rises smoothly in 0.8 s and holds for 2 s, with early termination as at level standard. Neighbours are free
+bodies on the table, which must not move by 2 cm or topple. The world frame of the simulation is the object frame at
+rest."""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ from graspd.worker.validation.protocol import MAX_PENETRATION_M, MAX_ROTATION, S
 #: Largest displacement [m] and tilt [rad] of a neighbour; rotation about the vertical is allowed.
 NEIGHBOUR_MOVED_M: Final = 0.02
 NEIGHBOUR_TILTED: Final = MAX_ROTATION
-#: Number of postures checked between two waypoints of an approach.
-LOOKS: Final = 4
+LOOKS: Final = 4  # number of postures checked between two waypoints of an approach
 #: Largest penetration of the open hand into the object's convex pieces on its approach [m]. The pieces protrude by up
 #: to this much from a surface that the hand does not touch. Supports are exact.
 OVERHANG_M: Final = 0.002
@@ -38,8 +37,7 @@ OVERHANG_M: Final = 0.002
 #: test has 25 m/s2.
 RISING: Final = 100
 RISING_S: Final = 0.008
-#: Steps of the rise between two checks for a lost object.
-LOSSES: Final = 5
+LOSSES: Final = 5  # steps of the rise between two checks for a lost object
 SMOOTHLY: Final = np.asarray(np.polyval([6, -15, 10, 0, 0, 0], np.linspace(0, 1, RISING + 1)[1:]), float)
 
 
@@ -99,10 +97,8 @@ class Lift(Test):
             rollout.steps = self._steps
             return rollout
         self._rise(grasps, row)
-        inner = Rollout()
-        outcome = self._validate(inner)
-        if outcome is Outcome.HELD:
-            outcome = self._hold(inner)
+        if (outcome := self._validate(Rollout())) is Outcome.HELD:
+            outcome = self._hold(Rollout())
         rollout = self._result(rollout, outcome)
         if rollout.success and self._neighbours_moved():
             rollout.outcome = LiftOutcome.NEIGHBOUR_MOVED
@@ -194,8 +190,8 @@ class Lift(Test):
 
     def _root_deviation(self) -> tuple[Floats, Floats] | None:
         """Return the root's position (3,) and its rotation (4,) relative to the command.
-        None if the root is fixed, or motion is measured in the world. Unlike an arm, the protocol's weld yields by 10
-        degrees under the weight of a hammer. An object that only follows this deviation has not moved in the hand."""
+        None if the root is fixed, or motion is measured in the world. The protocol's weld yields by 10 degrees under a
+        hammer; an object that follows this deviation has not moved in the hand."""
         at = self.scene.root_qpos
         if at < 0 or not self._in_hand:
             return None

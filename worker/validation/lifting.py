@@ -25,11 +25,9 @@ from graspd.worker.validation.lift import Lift, LiftOutcome, LiftTest
 from graspd.worker.validation.model import TOUCH_ROUNDING_M, MujocoOptions, scene_of
 
 LiftLevel = Literal["dexgraspbench", "lift"]
-#: Finished lifts, by `lift_digest`.
-KnownLifts = dict[str, LiftTest]
+KnownLifts = dict[str, LiftTest]  # finished lifts, by `lift_digest`
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
-#: Revision of the lift test's code; increase it if code (not a constant) changes verdicts.
-REVISION: Final = 5
+REVISION: Final = 5  # revision of the lift test's code; increase it if code (not a constant) changes verdicts
 _MOVES: Final = {surroundings: ("RISE_M",), protocol: ("LOOKS", "OVERHANG_M", "LOSSES"), postures: ("ROOM_M", "WIDE")}
 
 
@@ -37,14 +35,12 @@ _MOVES: Final = {surroundings: ("RISE_M",), protocol: ("LOOKS", "OVERHANG_M", "L
 class LiftVerdicts:
     """Verdicts of the lift test on N grasps."""
 
-    success: NDArray[np.int8]
-    """(N,) 1 lifted and held, 0 not."""
+    success: NDArray[np.int8]  # (N,) 1 lifted and held, 0 not
     outcome: NDArray[np.uint8]
     margin: NDArray[np.float64]
     level: LiftLevel
     hard: bool
-    terms: str
-    """Digest of everything that affects a verdict except the grasp and its scene."""
+    terms: str  # digest of everything that affects a verdict except the grasp and its scene
     seconds: float
 
     @property
@@ -66,37 +62,32 @@ def validate_lifts(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> LiftVerdicts:
     """Validate grasps by lifts out of their scenes; see `worker.validation.lift`.
-    Raises InputError: unknown level, or a grasp has no scene or approach. MeshError: the object has no usable convex
-    pieces. TaskCancelled: `run.cancelled()` returned True.
+    Raises InputError: unknown level, or a grasp has no scene or approach; and the other errors of `validate`.
 
     Args:
-        hand: the hand; its stiffness and effort are the actuators' gains and limits.
-        obj: the object, with its mass and friction; `ObjectModel.for_dexgraspbench` has those of the protocol.
         grasps: N grasps with pregrasp, squeeze and, for level lift, approach.
         placed: the grasps' scenes; `index` has the scene of each grasp.
         hard: sliding friction halved, torsional friction a tenth; also for supports.
-        pieces: convex pieces of the object; by default its CoACD pieces.
         known: finished lifts of this hand, object and level; they are reused, and new lifts are added.
-        run: receives the number of finished grasps; polled for cancellation between grasps."""
+
+    All other arguments are those of `validate`."""
     require_approaches(grasps, placed, level)
     began = time.perf_counter()
     pieces = pieces or decompose(obj)
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
     scene = scene_of(hand, obj, pieces, physics, placed.supports, placed.neighbours)
-    done = Count(len(grasps), run, "lifts")
+    done, finished = Count(len(grasps), run, "lifts"), {} if known is None else known
 
-    def ask(test: Lift, row: int) -> LiftTest:
+    def lift(test: Lift, row: int) -> LiftTest:
         run.check("the validator")
-        key = lift_digest(grasps, row, placed, hard=hard) if known is not None else ""
-        rollout = known.get(key) if known is not None else None
-        if rollout is None:
+        key = lift_digest(grasps, row, placed, hard=hard)
+        if (rollout := finished.get(key)) is None:
             rollout = test.dexgraspbench(grasps, row) if level == "dexgraspbench" else test.lift(grasps, row)
-            if known is not None:
-                known[key] = rollout
+            finished[key] = rollout
         done.add(1)
         return rollout
 
-    rollouts = evaluate_rows(range(len(grasps)), lambda: Lift(scene, placed), ask, threads=run.cores, name="lift")
+    rollouts = evaluate_rows(range(len(grasps)), lambda: Lift(scene, placed), lift, threads=run.cores, name="lift")
     return LiftVerdicts(
         success=np.array([t.success for t in rollouts], np.int8),
         outcome=np.array([t.outcome for t in rollouts], np.uint8),

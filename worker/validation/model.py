@@ -27,12 +27,10 @@ from graspd.worker.validation.decomposition import ConvexPieces
 #: Sliding and torsional friction; `hard` scales them by `HARD`.
 FRICTION: Final = (SLIDING, 0.02)
 HARD: Final = (0.5, 0.1)
-#: Joint damping over position gain [s]: 0.1 N m s/rad at the protocol's gain of 5.
-DAMPING_TIME: Final = 0.02
+DAMPING_TIME: Final = 0.02  # joint damping over position gain [s]: 0.1 N m s/rad at the protocol's gain of 5
 HAND_SOLIMP: Final = (0.5, 0.99, 1e-4, 0.5, 2.0)
 HAND_SOLREF: Final = (0.005, 1.0)
-#: Time constant [s] and damping ratio of couplings. They are stiffer than contacts: otherwise a pressed finger would
-#: stretch them. MuJoCo's minimum is 2 steps.
+#: Time constant [s] (at least 2 steps) and damping ratio of couplings: stiffer than contacts, which would stretch them.
 COUPLING_SOLREF: Final = (0.008, 1.0)
 COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
 #: Features of today's MuJoCo that version 3.3.2, pinned by DexGraspBench, lacks: several contacts per pair of convex
@@ -41,8 +39,7 @@ NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjt
 #: Least number of dofs for sparse Jacobians; MuJoCo's own rule is 60. Lift time, sparse over dense Jacobians:
 #: .77 for 28 dofs (Allegro), .73 for 34 (Shadow), 1.09 for 20 (Barrett). Verdicts differ only by rounding.
 SPARSE: Final = 24
-#: A body without geometry has the inertia of a ball of this radius [m].
-_BARE_RADIUS: Final = 0.01
+_BARE_RADIUS: Final = 0.01  # a body without geometry has the inertia of a ball of this radius [m]
 _MIN_MASS: Final = 1e-3
 #: Numerical tolerance of fingertips that may touch a support [m]: the trajectory is checked in steps.
 TOUCH_ROUNDING_M: Final = 1e-4
@@ -90,17 +87,13 @@ class Scene:
     hand_geoms: NDArray[np.bool_]
     object_body: int
     object_qpos: int
-    root_qpos: int
-    """-1 if the root is fixed."""
-    joint_qpos: NDArray[np.intp]
-    """(J,) in `HandModel.joint_names` order."""
-    dof_gain: Floats
-    """(D,) `dof_gain * q + dof_shift` is the position of each dof's leading joint."""
+    root_qpos: int  # -1 if the root is fixed
+    joint_qpos: NDArray[np.intp]  # (J,) in `HandModel.joint_names` order
+    dof_gain: Floats  # (D,) `dof_gain * q + dof_shift` is the position of each dof's leading joint
     dof_shift: Floats
     pulls: Floats | None
     """(A, D) matrix from positions of leading joints to the actuators' controls; None if both are equal."""
-    centre: Floats
-    """(3,) the object's centre of mass in the object frame."""
+    centre: Floats  # (3,) the object's centre of mass in the object frame
     mass: float
     support_geoms: NDArray[np.bool_]
     """(G,) geoms of the scene's supports and neighbours; the scene frame is the mocap body 1."""
@@ -177,8 +170,7 @@ def build(
     )
 
 
-#: `build`, cached. Threads share the scene: its model is read-only.
-scene_of = cached_by_content(8)(build)
+scene_of = cached_by_content(8)(build)  # cached `build`; threads share the read-only scene
 
 
 def _pressing(model: Any, supports: Sequence[Obstacle]) -> Floats:
@@ -187,6 +179,19 @@ def _pressing(model: Any, supports: Sequence[Obstacle]) -> Floats:
         if support.tips_m is not None and support.tips_m < CLEAR_M:
             out[model.geom(f"support{i}").id] = max(0.0, -support.tips_m) + TOUCH_ROUNDING_M
     return out
+
+
+def empty_spec(timestep: float) -> Any:
+    """Return a spec without bodies, with the protocol's solver and a time step [s]."""
+    spec = mujoco.MjSpec()
+    # MJCF angles are degrees by default: limits in radians would lock every finger without an error.
+    spec.compiler.degree = False
+    spec.memory = ARENA
+    spec.option.timestep = timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    return spec
 
 
 def scene_spec(
@@ -199,23 +204,18 @@ def scene_spec(
 ) -> Any:
     """Return the spec that `build` compiles.
     Names: `body0` ..., `joint1` ..., `dof0` ... (actuators), object, supports, `neighbour0` ..."""
-    spec = mujoco.MjSpec()
-    # MJCF angles are degrees by default: limits in radians would lock every finger without an error.
-    spec.compiler.degree = False
-    option = spec.option
-    option.timestep = physics.timestep
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.impratio = 10.0
-    option.noslip_iterations = physics.noslip_iterations
-    spec.memory = ARENA
-    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | (NOT_IN_3_3_2 & ~multi_contact_flags(hand))
+    spec = empty_spec(physics.timestep)
+    spec.option.noslip_iterations = physics.noslip_iterations
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | (NOT_IN_3_3_2 & ~multi_contact_flags(hand))
     slide, twist = (coefficient * obj.friction / SLIDING for coefficient in physics.friction)
     friction = [slide, twist, 1e-4]
     _add_hand(spec, hand, friction, physics.root)
     add_object(spec, obj, pieces.vertices, friction, obj.mass)
     if supports:
-        _add_supports(spec, supports, friction)
+        # The scene's pose in the object frame is that of this mocap body.
+        body = spec.worldbody.add_body(name="supports", mocap=True)
+        for i, support in enumerate(supports):
+            add_support(spec, body.add_geom(condim=4, friction=friction, name=f"support{i}"), support)
     for k, one in enumerate(neighbours):
         add_object(spec, one.obj, one.pieces, friction, one.obj.mass, name=f"neighbour{k}")
     return spec
@@ -223,7 +223,7 @@ def scene_spec(
 
 def multi_contact_flags(hand: HandModel) -> int:
     """Return the flags of `NOT_IN_3_3_2` that a gripper needs: flat pads touch flat sides over an area.
-    With a single contact point the object would rotate unrealistically. The protocol was made for rounded fingers."""
+    The protocol is for rounded fingers; at a single contact point the object would rotate unrealistically."""
     return int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) if jaws_of(hand) is not None else 0
 
 
@@ -369,13 +369,6 @@ def add_object(
     for i, corners in enumerate(pieces):
         geom = body.add_geom(condim=4, friction=friction, name=f"{name}-{i}")
         add_mesh(spec, geom, corners - obj.centre_of_mass, f"{name}-{i}")
-
-
-def _add_supports(spec: Any, supports: Sequence[Obstacle], friction: list[float]) -> None:
-    """Add planes and convex solids to a mocap body, placed at the scene's pose in the object frame."""
-    body = spec.worldbody.add_body(name="supports", mocap=True)
-    for i, support in enumerate(supports):
-        add_support(spec, body.add_geom(condim=4, friction=friction, name=f"support{i}"), support)
 
 
 def add_support(spec: Any, geom: Any, support: Obstacle) -> None:

@@ -1,17 +1,17 @@
 """Payload of grasps: heaviest mass that each lifts or holds; shake test; limit and load capacity.
 
-The hand closes once around the object at its own mass. Then the mass is varied: the object hangs, or is pushed, until
-its motion decides. The search begins near the mass that the contact forces of the closed hand bear. Each hanging test
-starts from the final state of the heaviest mass that passed, each push from the closed hand.
+Payload: the hand closes once around the object at its own mass. Then the object hangs, or is pushed, at other masses.
+The search begins near the mass that the contact forces of the closed hand bear. A hanging test starts from the final
+state of the heaviest mass that passed, a push from the closed hand.
 
-The shake moves a lifted object to and fro, first along x of the scene, then along y. In the simulation the hand is at
-rest and the inertial force of the motion acts on the object. Accelerations begin at zero; the constant velocity that
-this adds to the hand has no effect (Galilean invariance).
+Shake: a lifted object is moved to and fro, first along x of the scene, then along y. In the simulation the hand is at
+rest and the inertial force acts on the object. Accelerations begin at zero; the constant velocity that this adds has no
+effect (Galilean invariance).
 
-Load capacity: the heaviest object that contact forces could bear within actuator limits and friction. Each direction of
-the weight has one linear program. Contact forces inside friction pyramids balance the weight and all torques about the
-centre of mass, and no drive exceeds its effort. The result is an upper bound: maybe no controller can exert the forces,
-and pyramids enclose the cones. Forces on the palm, along joint axes, or towards a joint's stop cost no effort."""
+Load capacity: the heaviest object that contact forces could bear within actuator limits and friction, by one linear
+program per direction of the weight. Forces inside friction pyramids balance the weight and all torques about the centre
+of mass, and no drive exceeds its effort. The result is an upper bound: maybe no controller can exert the forces, and
+pyramids enclose the cones. Forces on the palm, along joint axes, or towards a joint's stop cost no effort."""
 
 from __future__ import annotations
 
@@ -43,13 +43,11 @@ from graspd.worker.validation.model import Scene, scene_of
 from graspd.worker.validation.prescreening import HANGING_CLOSING, LIFTING, FixedRootScene
 from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test
 
-#: Ratio of upper to lower bound at which the search ends; the payload is the lower bound.
-TOLD: Final = 1.03
+TOLD: Final = 1.03  # ratio of upper to lower bound at which the search ends; the payload is the lower bound
 #: First mass as a share of `_bearable_mass` (median in `benchmarks.payload`), and first ratio of masses.
 FIRST: Final = 0.75
 STEP: Final = math.sqrt(2)
-#: Largest number of stages of simulation per load.
-WATCHED: Final = 10
+WATCHED: Final = 10  # largest number of stages of simulation per load
 
 
 class _WeightTest(Test):
@@ -184,10 +182,8 @@ def payloads(
 #: the grasps may be the cause. The light object has the default mass, at most the share `LIGHT` of the wanted mass.
 LEAST: Final = 2
 LIGHT: Final = 1 / 8
-#: Fewest tested grasps before a job gives up because the wanted mass is out of reach.
-ENOUGH: Final = 8
-#: Ratio of wanted mass to best payload above which the wanted mass is out of reach.
-HOPELESS: Final = 2.0
+ENOUGH: Final = 8  # fewest tested grasps before a job gives up because the wanted mass is out of reach
+HOPELESS: Final = 2.0  # ratio of wanted mass to best payload above which the wanted mass is out of reach
 
 
 @dataclass(frozen=True)
@@ -197,10 +193,8 @@ class Limit:
     hand: str
     friction: float
     grasps: int
-    lifts_kg: float
-    """Largest payload of the grasps, from simulated lifts."""
-    bound_kg: float
-    """Largest load capacity of the grasps, at least `lifts_kg`."""
+    lifts_kg: float  # largest payload of the grasps, from simulated lifts
+    bound_kg: float  # largest load capacity of the grasps, at least `lifts_kg`
     wanted_kg: float | None = None
 
     @property
@@ -251,8 +245,7 @@ def limit_of(
 AMPLITUDE_M: Final = 0.02
 FREQUENCY_HZ: Final = 3.0
 PERIODS: Final = 3
-#: The force changes in steps of this length [s].
-STEP_S: Final = 0.008
+STEP_S: Final = 0.008  # the force changes in steps of this length [s]
 
 
 class Shake(FixedRootScene):
@@ -301,10 +294,8 @@ _POINTS: Final = 600
 #: Hand points within this distance of the object count as contacts [m]; at most `MOST` are used, widely spread.
 WITHIN_M: Final = 0.01
 MOST: Final = 32
-#: A joint closer to its limit than this share of its range rests on its stop.
-AT_STOP: Final = 0.02
-#: Status of `linprog` for an unbounded problem.
-_UNBOUNDED: Final = 3
+AT_STOP: Final = 0.02  # a joint closer to its limit than this share of its range rests on its stop
+_UNBOUNDED: Final = 3  # status of `linprog` for an unbounded problem
 
 
 def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Floats) -> Floats:
@@ -326,8 +317,8 @@ def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Float
         moments = cross((points - obj.centre_of_mass)[:, None] / obj.radius, forces)
         # Torque limits of each dof, for its positive and then its negative direction; unlimited at a stop.
         near, rest = AT_STOP * hand.span, q[row]
-        bounds = (np.where(stop, np.inf, hand.effort) for stop in (rest > hand.upper - near, rest < hand.lower + near))
-        efforts = np.concatenate([*bounds])
+        stops = (rest > hand.upper - near, rest < hand.lower + near)
+        efforts = np.concatenate([np.where(stop, np.inf, hand.effort) for stop in stops])
         loads = [
             _largest_load(forces.reshape(-1, 3), moments.reshape(-1, 3), torques.reshape(-1, hand.dofs), efforts, along)
             for along in against[row]

@@ -1,10 +1,9 @@
-"""Short tests with coarse physics: rollouts that rank a planner's candidates.
+"""Short tests with coarse physics that rank a planner's candidates at a fifth of a verdict's cost.
 
-The hand closes and squeezes around the object in a fraction of the time of the full test. In a scene the support is
-then removed, and most of the object's weight pulls for a moment. A free object is pushed towards the corners of a
-tetrahedron, with nearly twice its weight. Friction is halved in these tests. Objects that slip are tested once more
-from the same closed hand at full friction; in a scene the pull is then 30 % above the weight. The result is not a
-verdict: it ranks candidates at a fifth of a verdict's cost, and the full test still validates the selected ones."""
+The hand closes and squeezes around the object. In a scene the support is then removed, and most of the object's weight
+pulls for a moment. A free object is pushed towards the corners of a tetrahedron, with nearly twice its weight. Friction
+is halved. Objects that slip are tested once more from the same closed hand at full friction; in a scene the pull is
+then 30 % above the weight. The full test still validates the selected candidates."""
 
 from __future__ import annotations
 
@@ -49,20 +48,13 @@ PUSHED: Final = 2
 HANGS: Final = 0.8
 HANGS_WHOLE: Final = 1.3
 PULL: Final = 1.8
-#: Ratio of motion to its limit from which on the object is lost.
-GONE: Final = 1.5
+GONE: Final = 1.5  # ratio of motion to its limit from which on the object is lost
 #: Push directions of a free object: every direction is within 71 degrees of one of them.
 CORNERS: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
-#: Distance by which supports are removed [m]: more than the height of any scene.
-AWAY_M: Final = 10.0
-#: Added to the score of grasps that hold only at full friction.
-SLIPS: Final = 1.0
-#: Score of grasps that start in deep penetration.
-DEEP: Final = 20.0
-
-
-#: Scenes compiled at half and at full friction; everything else is the same.
-Frictions = tuple[Scene, Scene]
+AWAY_M: Final = 10.0  # distance by which supports are removed [m]: more than the height of any scene
+SLIPS: Final = 1.0  # added to the score of grasps that hold only at full friction
+DEEP: Final = 20.0  # score of grasps that start in deep penetration
+Frictions = tuple[Scene, Scene]  # scenes compiled at half and at full friction; everything else is the same
 
 
 class LiftRollout(Lift):
@@ -107,8 +99,7 @@ class PushRollout(Test):
 
     def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
         """Return the largest ratio of motion to its limit in pushes at half friction; below 1 if held.
-        Otherwise return the ratio at full friction plus `SLIPS`.
-        Return inf as soon as the score cannot be below `beat`; if `beat` is below 1 + `SLIPS`, skip full friction."""
+        Otherwise return the ratio at full friction plus `SLIPS`, or inf as soon as the score cannot be below `beat`."""
         self.scene = self._half
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return DEEP
@@ -137,8 +128,7 @@ class PushRollout(Test):
 
 
 class ShortTests:
-    """Short tests of one hand and one object; thread-safe. Scenes are compiled on first use.
-    All grasps must have the same supports and neighbours."""
+    """Short tests of one hand and one object with common supports and neighbours; thread-safe."""
 
     def __init__(
         self, hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
@@ -149,8 +139,7 @@ class ShortTests:
 
     def scores(self, grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
         """Return scores (N,) (`worker.planners.Rollout`), by lifts if `placed` is given, else by pushes.
-        Scores are below 1 for grasps that hold at half friction, and below 2 for grasps that hold at full friction.
-        Each call uses `threads`; planners on the CPU already call from all their threads."""
+        Scores are below 1 for grasps that hold at half friction, and below 2 for those that hold at full friction."""
         with self._lock:
             if self._scenes is None:
                 around = (placed.supports, placed.neighbours) if placed is not None else ()
@@ -170,8 +159,7 @@ class ShortTests:
         return np.array(evaluate_rows(range(len(grasps)), make, score, threads=self.threads, name="short-test"), float)
 
 
-#: Number of stages of closing and of squeezing.
-HANGING_CLOSING: Final = 4
+HANGING_CLOSING: Final = 4  # number of stages of closing and of squeezing
 #: Pull on a hanging object, in weights: mean over the accelerating part of a smooth rise (`lift.SMOOTHLY`).
 RISING: Final = 1.06
 #: Duration of a load change [s], and number of its steps; a sudden change would act like up to twice the load.

@@ -9,7 +9,7 @@ fast: coarser physics (fixed root, 6 ms). Where the margin is not clear, level s
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Final
@@ -39,10 +39,8 @@ INTERVAL_S: Final = 0.04
 #: present rate and half of the limits accepts as many, but simulates 1.7 times as long.
 SURE: Final = 0.8
 AHEAD: Final = 2.0
-#: Share of the limits for extrapolated motion in a short test; below it the object counts as still.
-STILL: Final = 0.5
-#: Ratio of motion to its limit that stands for a state with numbers that are not finite.
-LOST: Final = 10.0
+STILL: Final = 0.5  # share of the limits for extrapolated motion in a short test; below it the object counts as still
+LOST: Final = 10.0  # ratio of motion to its limit that stands for a state with numbers that are not finite
 #: Rotation during closing or rising above which the object is lost [rad]; no passing grasp reached half of it.
 LOST_ROTATION: Final = math.radians(30.0)
 #: Coarse physics are trusted if their largest ratio of displacement or rotation to its limit is outside this band.
@@ -70,8 +68,7 @@ class ValidatedBy(IntEnum):
 @dataclass
 class Rollout:
     outcomes: list[Outcome] = field(default_factory=lambda: [Outcome.NOT_TRIED] * len(DIRECTIONS))
-    margin: float = 0.0
-    """Largest ratio of displacement or rotation to its limit, after the end of the squeeze."""
+    margin: float = 0.0  # largest ratio of displacement or rotation to its limit, after the end of the squeeze
     penetration_m: float = 0.0
     self_penetration_m: float = 0.0
     steps: int = 0
@@ -95,8 +92,7 @@ class Test:
         self.scene = scene
         self.data: Any = mujoco.MjData(scene.model)
         self._steps = 0
-        size = mujoco.mj_stateSize(scene.model, mujoco.mjtState.mjSTATE_INTEGRATION)
-        self._saved = np.empty(size)
+        self._saved = np.empty(mujoco.mj_stateSize(scene.model, mujoco.mjtState.mjSTATE_INTEGRATION))
 
     def dexgraspbench(self, grasps: GraspSet, row: int) -> Rollout:
         """Run the protocol as published, up to the first push that fails."""
@@ -104,22 +100,7 @@ class Test:
         if rollout.outcomes[0] is Outcome.PENETRATION:
             return rollout
         self._close(grasps, row)
-        self._save()
-        for direction in range(len(DIRECTIONS)):
-            # The simulation is deterministic: closing again would give the same state, bit for bit.
-            self._restore()
-            self._push(direction)
-            outcome = Outcome.HELD
-            for _ in range(round(HOLD_S / DEXGRASPBENCH_INTERVAL_S)):
-                self._run(DEXGRASPBENCH_INTERVAL_S)
-                outcome = self._validate(rollout)
-                if outcome is not Outcome.HELD:
-                    break
-            rollout.outcomes[direction] = outcome
-            if outcome is not Outcome.HELD:
-                break
-        rollout.steps = self._steps
-        return rollout
+        return self._push_all(rollout, self._hold_as_published)
 
     def standard(self, grasps: GraspSet, row: int) -> Rollout:
         """Close once, start every push from that state, and end each push as soon as it is decided."""
@@ -131,11 +112,16 @@ class Test:
             rollout.margin = max(rollout.margin, self._excess())
             rollout.steps = self._steps
             return rollout.fail(Outcome.DIVERGED if is_invalid(self.data) else Outcome.LOST_WHILE_CLOSING)
+        return self._push_all(rollout, self._hold)
+
+    def _push_all(self, rollout: Rollout, hold: Callable[[Rollout], Outcome]) -> Rollout:
+        """Push in all directions from the present state, up to the first push that fails."""
         self._save()
         for direction in range(len(DIRECTIONS)):
+            # The simulation is deterministic: closing again would give the same state, bit for bit.
             self._restore()
             self._push(direction)
-            rollout.outcomes[direction] = self._hold(rollout)
+            rollout.outcomes[direction] = hold(rollout)
             if rollout.outcomes[direction] is not Outcome.HELD:
                 break
         rollout.steps = self._steps
@@ -201,6 +187,14 @@ class Test:
     def _push(self, direction: int) -> None:
         self.data.xfrc_applied[:] = 0.0
         self.data.xfrc_applied[self.scene.object_body, :3] = self.scene.push_force * np.array(DIRECTIONS[direction])
+
+    def _hold_as_published(self, rollout: Rollout) -> Outcome:
+        outcome = Outcome.HELD
+        for _ in range(round(HOLD_S / DEXGRASPBENCH_INTERVAL_S)):
+            self._run(DEXGRASPBENCH_INTERVAL_S)
+            if (outcome := self._validate(rollout)) is not Outcome.HELD:
+                break
+        return outcome
 
     def _hold(self, rollout: Rollout) -> Outcome:
         """Simulate a push: reject once a limit is exceeded, accept once faster motion would stay below it."""

@@ -19,19 +19,16 @@ from graspd.worker.hands.primitives import hull, sample, signed_distance, tessel
 
 Fit = Literal["own", "hull", "primitive", "capsule"]
 
-#: A piece with a larger ratio of width to thickness than this is not replaced by a capsule.
-WIDE: Final = 1.5
-#: A shrunk piece keeps at least this share of its half thickness.
-_LEFT: Final = 0.5
+WIDE: Final = 1.5  # a piece with a larger ratio of width to thickness than this is not replaced by a capsule
+_LEFT: Final = 0.5  # a shrunk piece keeps at least this share of its half thickness
 _SAMPLES: Final = 400
-#: Least length of a capsule over its radius.
-_SHORTEST: Final = 1e-3
+_SHORTEST: Final = 1e-3  # least length of a capsule over its radius
 _PRIMITIVES: Final = ("box", "cylinder", "capsule")
 
 
 def refit_hand(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
     """Return the hand with its collision shapes replaced, then grown by `grown_m` [m] (negative: shrunk).
-    Contacts between bodies whose new shapes touch at rest are ignored, as in the original hand."""
+    Contacts of bodies whose new shapes touch at rest are ignored."""
     pieces = hand.pieces
     if fit == "hull":
         pieces = _hulls(hand)
@@ -145,9 +142,8 @@ def _primitive_like(piece: ConvexPiece, kind: str) -> ConvexPiece:
 
 def _capsule(solid: float, across: float) -> tuple[float, float]:
     """Return radius and length of a capsule of a volume [m^3] and a variance across its axis [m^2].
-    A variance above that of a ball gives nearly a ball. A cylinder's variance is r^2 / 4, a ball's r^2 / 5. A capsule's
-    variance is r^2 (1 / 4 - s / 20), where s is the caps' share of the volume. The solution iterates: s grows with r^3
-    and has little effect on r."""
+    The variance is r^2 (1 / 4 - s / 20), where s is the caps' share of the volume: 1 for a ball. The solution iterates,
+    since s grows with r^3 and has little effect on r."""
     radius = 2 * math.sqrt(across)
     for _ in range(20):
         caps = min(1.0, 4 / 3 * math.pi * radius**3 / solid)

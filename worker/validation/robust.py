@@ -1,8 +1,8 @@
 """Robustness: verdicts in other models of the same hand and object, and with the object displaced.
 
-A grasp is validated in k models. Each model differs from the nominal model along one axis (`variant`); axes alternate
-in random order. Models depend only on the seed and the grasp's own numbers. A grasp therefore gets the same models in
-any set, and the first 8 of 16 models equal those of a test with 8."""
+Each of k models differs from the nominal one along one axis (`variant`); axes alternate in random order. Models depend
+only on the seed and the grasp's own numbers. A grasp therefore gets the same models in any set, and the first 8 of 16
+models equal those of a test with 8."""
 
 from __future__ import annotations
 
@@ -29,8 +29,7 @@ from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.variant import Models, Variant, draw_variant, first_axes
 
 NOT_VALIDATED: Final = -1
-#: Numerical tolerance of wanted shares: 0.9 of 10 models is exactly 9.
-_EXACT: Final = 1e-9
+_EXACT: Final = 1e-9  # numerical tolerance of wanted shares: 0.9 of 10 models is exactly 9
 
 
 @dataclass(frozen=True)
@@ -66,12 +65,8 @@ class Robustness:
 
     def by_axis(self) -> dict[Axis, tuple[int, int]]:
         """Return the number of models in which a grasp held, and of all models, for each validated axis."""
-        counts = {}
-        for axis in Axis:
-            found = self.held[(self.axis == axis) & (self.held != NOT_VALIDATED)]
-            if len(found):
-                counts[axis] = (int(found.sum()), len(found))
-        return counts
+        validated = {axis: self.held[(self.axis == axis) & (self.held != NOT_VALIDATED)] for axis in Axis}
+        return {axis: (int(held.sum()), len(held)) for axis, held in validated.items() if len(held)}
 
 
 def needed_models(wanted: float, models: int) -> int:
@@ -107,9 +102,8 @@ def validate_robustness(
         placed: the grasps' scenes, for the lift test; None for six pushes.
         wanted: share of models in which a grasp must hold; a grasp's tests end once this is decided. 0 tests in all.
         seed: seed of the models, together with the grasp's own numbers.
-        hard: sliding friction halved, torsional friction a tenth.
-        pieces: convex pieces of the object; by default its CoACD pieces.
-        run: receives the number of finished grasps; polled for cancellation between models."""
+
+    All other arguments are those of `validate`; `run` is polled for cancellation between models."""
     if placed is not None:
         require_approaches(grasps, placed, level)
     began = time.perf_counter()
@@ -144,14 +138,11 @@ def validate_robustness(
 
 
 def models_of(hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int) -> list[tuple[Axis, Variant]]:
-    words = (seed, *_digest_words(grasps, row))
-    axes = first_axes(hand, models, words)
-    return [(axis, draw_variant(axis, hand, np.random.default_rng((*words, k)))) for k, axis in enumerate(axes)]
-
-
-def _digest_words(grasps: GraspSet, row: int) -> tuple[int, ...]:
+    """Return the axis and the variant of each model in which one grasp is validated."""
     whole = hashlib.sha256()
     for part in (grasps.pregrasp, grasps.grasp, grasps.squeeze):
         for array in (part.hand_pose, part.joint_positions):
             whole.update(np.ascontiguousarray(array[row], "<f8").tobytes())
-    return tuple(np.frombuffer(whole.digest()[:16], "<u4").tolist())
+    words = (seed, *np.frombuffer(whole.digest()[:16], "<u4").tolist())
+    axes = first_axes(hand, models, words)
+    return [(axis, draw_variant(axis, hand, np.random.default_rng((*words, k)))) for k, axis in enumerate(axes)]

@@ -25,43 +25,33 @@ from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, pref
 from graspd.worker.validation.protocol import DIRECTIONS, FAST_BAND, Outcome, Rollout, Test
 
 log = logging.getLogger(__name__)
-#: Grasps per task of a process pool: few, so that many processes share one batch.
-_CHUNK: Final = 2
+_CHUNK: Final = 2  # grasps per task of a process pool: few, so that many processes share one batch
 LEVELS: Final = ("dexgraspbench", "standard", "fast")
-#: Finished rollouts, by `postures_key` of one grasp.
-KnownRollouts = dict[str, Rollout]
+KnownRollouts = dict[str, Rollout]  # finished rollouts, by `postures_key` of one grasp
 
 
 @dataclass(frozen=True)
 class Verdicts:
     """Verdicts of the validator on N grasps. Success rates with different terms are not comparable."""
 
-    success: NDArray[np.int8]
-    """(N,) 1 held in all six directions, 0 not."""
+    success: NDArray[np.int8]  # (N,) 1 held in all six directions, 0 not
     outcome: NDArray[np.uint8]
     """(N, 6) `Outcome` of each push +x -x +y -y +z -z; pushes after the first failure are not simulated."""
-    margin: Floats
-    """(N,) largest ratio of displacement or rotation to its limit."""
-    penetration_depth_mm: Floats
-    """(N,) penetration of hand and object, measured with the engine's convex pieces."""
+    margin: Floats  # (N,) largest ratio of displacement or rotation to its limit
+    penetration_depth_mm: Floats  # (N,) penetration of hand and object, measured with the engine's convex pieces
     self_penetration_depth_mm: Floats
     level: str
     hard: bool
     pieces: int
-    volume_ratio: float
-    """Ratio of the volume of the convex pieces to the object's volume."""
-    excess_m: float
-    """Mean height of the pieces above the object's surface [m]."""
-    terms: str
-    """`verdict_key`: digest of everything that affects a verdict except the grasp."""
-    key: str
-    """Digest of the terms and of the validated postures."""
+    volume_ratio: float  # ratio of the volume of the convex pieces to the object's volume
+    excess_m: float  # mean height of the pieces above the object's surface [m]
+    terms: str  # `verdict_key`: digest of everything that affects a verdict except the grasp
+    key: str  # digest of the terms and of the validated postures
     validated_by: NDArray[np.uint8]
     """(N,) `ValidatedBy`: engine of the verdict. Only MuJoCo on the CPU is the reference."""
     seconds: float
     steps: int
-    rechecked: int = 0
-    """Prefilter verdicts that the CPU rechecked; where they differ, the CPU's verdict is used."""
+    rechecked: int = 0  # prefilter verdicts that the CPU rechecked; where they differ, the CPU's verdict is used
     contradicted: int = 0
 
     @property
@@ -90,9 +80,9 @@ def validate(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Verdicts:
     """Validate grasps by DexGraspBench's force-closure protocol; levels: see `worker.validation.protocol`.
-    MuJoCo releases the GIL while it steps, so threads can use a few cores; for many cores, `run` needs a process pool.
-    If `run` has a prefilter, it decides clear cases, see `worker.validation.prefilter.prefilter`. Raises InputError:
-    unknown level. MeshError: the object has no usable convex pieces. TaskCancelled: `run.cancelled()` returned True.
+    Threads can use a few cores, since MuJoCo releases the GIL while it steps; for many cores, `run` needs a pool. A
+    prefilter of `run` decides clear cases (`worker.validation.prefilter.prefilter`). Raises InputError: unknown level.
+    MeshError: the object has no usable convex pieces. TaskCancelled: `run.cancelled()` returned True.
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
@@ -116,17 +106,15 @@ def validate(
     first = prefilter or _run_prefilter(case, terms, grasps, level, run if prefilter_terms else None)
     rollouts = dict(first.stands)
     left = [row for row in range(len(grasps)) if row not in rollouts]
-    keys = {} if known is None else {row: postures_key(terms, grasps.take(slice(row, row + 1))) for row in left}
-    if known is not None:
-        rollouts |= {row: known[key] for row, key in keys.items() if key in known}
+    keys = {row: postures_key(terms, grasps.take(slice(row, row + 1))) for row in left}
+    known = {} if known is None else known
+    rollouts |= {row: known[key] for row, key in keys.items() if key in known}
     _run_tests(case, grasps, [row for row in left if row not in rollouts], rollouts, run)
-    if known is not None:
-        known |= {key: rollouts[row] for row, key in keys.items()}
+    known |= {key: rollouts[row] for row, key in keys.items()}
     contradicted = first.count_contradicted(rollouts)
     if not first.is_trusted(contradicted):
-        log.warning(
-            "%d of %d rechecked verdicts are wrong: the CPU validates all grasps", contradicted, len(first.rechecked)
-        )
+        counts = (contradicted, len(first.rechecked))
+        log.warning("%d of %d rechecked verdicts are wrong: the CPU validates all grasps", *counts)
         _run_tests(case, grasps, list(first.stands), rollouts, run)
     ordered = [rollouts[row] for row in range(len(grasps))]
     return Verdicts(

@@ -1,7 +1,7 @@
 """Variants of the validator's model: other plausible shapes, drives, tendons, masses and poses.
 
-A `Variant` describes how a model departs from the nominal one. `draw_variant` draws one, and `Models` validates in it:
-new shapes are recompiled, other numbers are changed in a copy."""
+`draw_variant` draws a `Variant`, and `Models` validates in it: new shapes are recompiled, other numbers changed in a
+copy."""
 
 from __future__ import annotations
 
@@ -29,8 +29,7 @@ from graspd.worker.validation.refit import Fit, fits_of, refit_hand
 
 Vector = tuple[float, float, float]
 
-#: Ranges of the axes. Growth or shrinkage of shapes [m].
-GROWTH_M: Final = 1e-3
+GROWTH_M: Final = 1e-3  # growth or shrinkage of collision shapes [m]
 #: Largest factor on damping, gains, `ARMATURE`, `DRY_FRICTION` and the object's mass; the least is its inverse.
 FACTOR: Final = 2.0
 #: Armature [kg m^2] and dry friction [N m] of DexGraspBench's Shadow hand, which the protocol omits for other hands.
@@ -41,8 +40,7 @@ FRICTIONS: Final = (0.4 / 0.6, 0.8 / 0.6)
 CENTRE_M: Final = 5e-3
 SHIFT_M: Final = 2e-3
 TURN: Final = float(np.radians(2.0))
-#: Latest start of a finger after the first one, as a share of the closing time (0.8 s).
-LATEST: Final = 0.25
+LATEST: Final = 0.25  # latest start of a finger after the first one, as a share of the closing time (0.8 s)
 
 Coupling = Literal["own", "compliant", "separate", "ratio"]
 
@@ -51,30 +49,20 @@ Coupling = Literal["own", "compliant", "separate", "ratio"]
 class Variant:
     """A model near the nominal one (the default). Lengths in m; factors apply to the model's own values."""
 
-    fit: Fit = "own"
-    """Replacement of the hand's collision shapes, see `refit`."""
+    fit: Fit = "own"  # replacement of the hand's collision shapes, see `refit`
     grown_m: float = 0.0
-    armature: float | None = None
-    """Armature of every joint [kg m^2 or kg]; None for the model's own."""
-    dry_friction: float | None = None
-    """Dry friction of every joint [N m or N]; None for the model's own."""
+    armature: float | None = None  # armature of every joint [kg m^2 or kg]; None for the model's own
+    dry_friction: float | None = None  # dry friction of every joint [N m or N]; None for the model's own
     damping: float = 1.0
-    gain: float = 1.0
-    """Factor on the position gain; torque limits are unchanged."""
-    coupling: Coupling = "own"
-    """compliant: couplings yield under load; separate, ratio: see `replace_coupling`."""
+    gain: float = 1.0  # factor on the position gain; torque limits are unchanged
+    coupling: Coupling = "own"  # compliant: couplings yield under load; separate, ratio: see `replace_coupling`
     friction: float = 1.0
-    mass: float = 1.0
-    """Factor on the object's mass; pushes equal its weight and grow with it."""
+    mass: float = 1.0  # factor on the object's mass; pushes equal its weight and grow with it
     centre_m: Vector = (0.0, 0.0, 0.0)
-    object_shift_m: Vector = (0.0, 0.0, 0.0)
-    """Shift of the object, in its frame [m]."""
-    object_turn: Vector = (0.0, 0.0, 0.0)
-    """Rotation vector of the object about its centre of mass [rad]."""
-    hand_shift_m: Vector = (0.0, 0.0, 0.0)
-    """Constant offset of the hand's root, in its own frame [m]."""
-    lags: tuple[float, ...] = ()
-    """Delay of each fingertip's finger after the first one, as a share of the closing time."""
+    object_shift_m: Vector = (0.0, 0.0, 0.0)  # shift of the object, in its frame [m]
+    object_turn: Vector = (0.0, 0.0, 0.0)  # rotation vector of the object about its centre of mass [rad]
+    hand_shift_m: Vector = (0.0, 0.0, 0.0)  # constant offset of the hand's root, in its own frame [m]
+    lags: tuple[float, ...] = ()  # delay of each fingertip's finger after the first one, as a share of the closing time
 
 
 NOMINAL: Final = Variant()
@@ -101,9 +89,8 @@ def first_axes(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis
 
 
 def draw_variant(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
-    """Draw a variant of a hand along one axis.
-    Directions are uniform on the sphere, sizes uniform in their range, factors log-uniform. Raises ValueError: no axis
-    is given, or the hand has no couplings."""
+    """Draw a variant of a hand along one axis. Raises ValueError: no axis, or the hand has no couplings.
+    Directions are uniform on the sphere, sizes uniform in their range, factors log-uniform."""
     match axis:
         case Axis.SHAPES:
             fits = {"own", *fits_of(hand)}
@@ -230,8 +217,7 @@ class Models:
         self._fingers = _fingers(hand)
 
     def standard(self, grasps: GraspSet, row: int, variant: Variant) -> Rollout:
-        """Return the verdict of level standard on one grasp in a variant.
-        For the nominal variant it equals the verdict of `validate` bit for bit."""
+        """Validate one grasp in a variant at level standard, for the nominal one bit for bit as `validate`."""
         test = VariantTest(self.scene(variant), variant, self._lags(variant))
         return test.standard(self._projected(test.scene, displaced_grasp(self.obj, grasps, row, variant)), 0)
 
@@ -239,8 +225,7 @@ class Models:
         self, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, *, dexgraspbench: bool = False
     ) -> LiftTest:
         """Lift a grasp in a variant; for the nominal variant the result equals `validate_lifts` bit for bit.
-        `grasps` need an approach, except for `dexgraspbench`. `placed` has the scenes of all grasps, with the supports
-        and neighbours of these models. `dexgraspbench`: run the published test instead of the full one."""
+        `placed` has the scenes of all grasps. `dexgraspbench`: run the published test, which needs no approach."""
         number = int(placed.index[row])
         variant = restrict_to_support(variant, placed.scenes[number].up)
         one, where = displaced_grasp(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))
@@ -388,8 +373,7 @@ def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
 
 
 def restrict_to_support(variant: Variant, up: Floats) -> Variant:
-    """Restrict a variant to an object on a support: shifts along the support, turns about the vertical.
-    `up` (3,) is the direction against gravity, in the object frame."""
+    """Keep shifts along a support and turns about the vertical `up` (3,), object frame, of a variant."""
     if not moves_object(variant):
         return variant
     shift, turn = np.array(variant.object_shift_m), np.array(variant.object_turn)

@@ -111,12 +111,12 @@ def task_rows(record: JobRecord, ranges: range | None = None) -> Iterator[Row]:
 
 
 def sanitize(text: str, length: int | None = None) -> str:
-    """Return text that all databases accept: PostgreSQL rejects code zero and limits lengths."""
+    """Return text without NUL and cut to `length`, because PostgreSQL rejects both."""
     return text.replace("\0", "")[:length]
 
 
 def row_from(table: Table, record: object, **others: Any) -> Row:
-    """Return a row with a record's attributes; `others` replace some, and text is cut to column length."""
+    """Return a row of a record's attributes; `others` replace some. Text is cut to the column's length."""
     row = {column.name: getattr(record, column.name) for column in table.columns if column.name not in others} | others
     lengths = {column.name: getattr(column.type, "length", None) for column in table.columns}
     return {name: sanitize(value, lengths[name]) if isinstance(value, str) else value for name, value in row.items()}
@@ -146,7 +146,7 @@ def grasp_rows(manifest: ShardManifest) -> list[Row]:
 
 
 def asset_row(asset: Asset, check: Mapping[str, Any] | None) -> Row:
-    """Return the row of a hand, object or network. Built-in assets need no check."""
+    """Return the row of a hand, object or network; a built-in asset counts as accepted without a check."""
     found = check or ({"verdict": "accept"} if asset.builtin else {})
     plain = ("digest", "name", "filename", "size_bytes", "created", "builtin", "owner", "project", "shared")
     return {
@@ -164,7 +164,7 @@ def asset_row(asset: Asset, check: Mapping[str, Any] | None) -> Row:
 
 
 def _limited_facts(facts: dict[str, Any]) -> dict[str, Any]:
-    """Return all facts, or only numbers if the facts are too long; `check.json` has the rest."""
+    """Return all facts, or at most 100 numbers if the facts are too long; `check.json` has the others."""
     if len(json.dumps(facts)) <= _MOST_FACTS:
         return facts
     return {name[:100]: value for name, value in list(facts.items())[:100] if isinstance(value, int | float)}
@@ -174,24 +174,24 @@ def _limited_facts(facts: dict[str, Any]) -> dict[str, Any]:
 _JOBS_AT_ONCE: Final = 200
 _FACTS: Final = ("stage", "done", "last_attempt", "exhausted", "retried_upto")
 
-#: Option of a connection that suppresses reports of ended jobs.
+#: Execution option of a connection: ends of jobs are not appended to the outbox.
 QUIET: Final = "graspd_quiet"
-#: Prefix of the note about a job with tasks still to enter; the job's id follows.
+#: Prefix of notes about jobs with tasks not yet in the index; the job's id follows.
 ENTERING: Final = "entering "
 _WHOSE: Final = (jobs.c.project, jobs.c.owner)
 
 
 def derive_states(connection: Connection, job_id: str, batches: Collection[int] | None = None) -> State:
-    """Derive the states of a job's tasks, in all or some batches, and of the job; return the job's state."""
+    """Derive the states of a job and of its tasks in some batches (None: all); return the job's state."""
     return derive_task_and_job_states(connection, {job_id: batches})[job_id]
 
 
 def derive_task_and_job_states(
     connection: Connection, touched: Mapping[str, Collection[int] | None]
 ) -> dict[str, State]:
-    """Derive the states of tasks in some batches (None: all) and of their jobs; return the jobs' states.
+    """Derive the states of jobs and of their tasks in some batches (None: all); return the jobs' states.
 
-    If a job's first batch fails because of its scenes or the object's weight, the other batches are cancelled.
+    If a job's first batch fails because of its scenes or the object's weight, its other batches are cancelled.
     """
     states: dict[str, State] = {}
     for some in chunks(list(touched), _JOBS_AT_ONCE):
@@ -205,14 +205,12 @@ def _derive_task_states(connection: Connection, touched: Mapping[str, Collection
     facts = {row.id: row for row in connection.execute(query)}
     cancelled = {job for job, row in facts.items() if row.cancelled or row.hopeless}
     whole = [job for job, batches in touched.items() if batches is None or (job in facts and facts[job].hopeless)]
-    pairs = [
-        (job, batch) for job, batches in touched.items() if job not in whole for batch in sorted(set(batches or ()))
-    ]
+    partly = {job: batches for job, batches in touched.items() if job not in whole}
+    pairs = [(job, batch) for job, batches in partly.items() for batch in sorted(set(batches or ()))]
+    conditions = [tasks.c.job_id.in_(some) for some in chunks(whole)]
+    conditions += [tuple_(tasks.c.job_id, tasks.c.batch).in_(some) for some in chunks(pairs)]
     rows: list[Any] = []
-    for wanted in (
-        *(tasks.c.job_id.in_(some) for some in chunks(whole)),
-        *(tuple_(tasks.c.job_id, tasks.c.batch).in_(some) for some in chunks(pairs)),
-    ):
+    for wanted in conditions:
         query = select(*(tasks.c[name] for name in ("job_id", "id", "batch", "state", "ready", *_FACTS)))
         query = query.where(wanted).order_by(tasks.c.job_id, tasks.c.batch, tasks.c.position)
         rows += connection.execute(query).mappings()
@@ -251,14 +249,14 @@ def _changed_tasks(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, 
 
 
 def _derive_job_states(connection: Connection, ids: Sequence[str]) -> dict[str, State]:
-    # Six index look-ups; a query of distinct states would read every task of the job.
+    # One index look-up per state: a query of distinct states would read every task of the job.
     of_job = tasks.c.job_id == jobs.c.id
     probes = [exists().where(of_job, tasks.c.state == state.value).label(state.value) for state in State]
     probes.append(exists().where(notes.c.name == literal(ENTERING) + jobs.c.id).label("entering"))
     query = select(jobs.c.id, jobs.c.state.label("now"), jobs.c.finished, jobs.c.reason, *_WHOSE, *probes)
     known = {row["id"]: row for row in connection.execute(query.where(jobs.c.id.in_(ids))).mappings()}
     states: dict[str, State] = {}
-    ended: list[dict[str, Any]] = []
+    ended: list[Row] = []
     for job in ids:
         row = known.get(job)
         found = [state for state in State if row is not None and row[state.value]]
@@ -272,13 +270,11 @@ def _derive_job_states(connection: Connection, ids: Sequence[str]) -> dict[str, 
         if State.FAILED in found:
             first = select(tasks.c.reason).where(tasks.c.job_id == job, tasks.c.state == State.FAILED.value)
             values["reason"] = connection.scalar(first.order_by(tasks.c.batch, tasks.c.position).limit(1))
-        # Most jobs are unchanged; their rows are not written.
         if values != {"state": row["now"], "finished": row["finished"], "reason": row["reason"]}:
             connection.execute(update(jobs).where(jobs.c.id == job).values(**values))
             if state.is_final and state != row["now"]:
                 about = {"kind": "job", "subject": job, "state": state.value}
                 ended.append(about | {"project": row["project"], "owner": row["owner"]})
-    # A rebuild reports no past ends of jobs and datasets.
     if not connection.get_execution_options().get(QUIET):
         append_ends(connection, ended)
     return states
@@ -292,14 +288,14 @@ class Changes(IndexPart):
     """Writes of jobs, shards, attempts and assets. `within` makes a write part of a larger transaction."""
 
     def add_job(self, record: JobRecord, *, within: Connection | None = None) -> State:
-        """Add a job with all its tasks; tasks whose shard exists have succeeded."""
+        """Add a job with all its tasks; tasks whose shard exists count as succeeded."""
         with self.database.write_transaction(within) as connection:
             self._upsert_job(connection, record)
             self._upsert_tasks(connection, list(task_rows(record)))
             return derive_states(connection, record.id)
 
     def enter_job(self, record: JobRecord, *, within: Connection) -> None:
-        """Add a job with its first tasks; `enter_more` adds the other tasks of a large job."""
+        """Add a job with its first `RANGES_AT_ONCE` ranges of tasks; `enter_more` adds the other ones."""
         is_new = within.scalar(select(jobs.c.id).where(jobs.c.id == record.id)) is None
         self._upsert_job(within, record)
         self._enter(within, record, 0, goes_on=is_new)
@@ -310,11 +306,11 @@ class Changes(IndexPart):
         return [name.removeprefix(ENTERING) for name in self.database.column(query)]
 
     def enter_more(self, job_id: str, record: JobRecord | None) -> None:
-        """Add the next tasks of a large job; add no more if its record was deleted (None)."""
+        """Add the next tasks of a large job; without a record (None), for example after a deletion, stop."""
         with self.database.write_transaction() as connection:
-            is_there = connection.scalar(select(jobs.c.id).where(jobs.c.id == job_id)) is not None
+            exists_now = connection.scalar(select(jobs.c.id).where(jobs.c.id == job_id)) is not None
             note: Any = connection.scalar(select(notes.c.value).where(notes.c.name == ENTERING + job_id))
-            if record is None or not is_there:
+            if record is None or not exists_now:
                 connection.execute(delete(notes).where(notes.c.name == ENTERING + job_id))
             elif note is not None:
                 self._enter(connection, record, note["range"], goes_on=True)
@@ -340,10 +336,10 @@ class Changes(IndexPart):
     def add_attempt(
         self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
     ) -> State | None:
-        """Add a failed attempt; the next is due at `not_before` [s]. Return the job's state, if it changed."""
+        """Add a failed attempt; the next is due at `not_before` [s]. Return the job's state, if changed."""
         with self.database.write_transaction(within) as connection:
             if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
-                return None  # The job is deleted, or the attempt is forged.
+                return None  # The job was deleted, or the attempt is forged.
             upsert(connection, attempts, [row_from(attempts, attempt, stage=attempt.stage.value)])
             values: dict[str, Any] = {
                 "last_attempt": attempt.number,
@@ -351,16 +347,15 @@ class Changes(IndexPart):
                 "reason": sanitize(attempt.reason),
                 "finished": attempt.ended if attempt.last else None,
                 "worker": sanitize(attempt.worker, 128) if attempt.last else None,
-                "state": State.QUEUED.value,
             }
-            values |= {"queued": False, "not_before": not_before, **NO_PROGRESS}
+            values |= {"state": State.QUEUED.value, "queued": False, "not_before": not_before, **NO_PROGRESS}
             is_next = (tasks.c.done.is_(False), tasks.c.last_attempt < attempt.number)
             changed = update(tasks).where(tasks.c.id == attempt.task_id, *is_next).values(**values)
             touched = connection.execute(changed.returning(tasks.c.job_id, tasks.c.batch)).first()
             return None if touched is None else derive_states(connection, touched.job_id, [touched.batch])
 
     def set_job_events(self, job_id: str, events: Sequence[JobEvent], *, within: Connection | None = None) -> State:
-        """Apply all events of a job so far, the oldest first, to the job and its tasks."""
+        """Apply the complete list of a job's events, oldest first, to the job and its tasks."""
         cancelled = bool(events) and events[-1].what == "cancelled"
         with self.database.write_transaction(within) as connection:
             connection.execute(update(jobs).where(jobs.c.id == job_id).values(cancelled=cancelled))
@@ -388,7 +383,7 @@ class Changes(IndexPart):
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "priority"])
 
     def _enter(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
-        """Add up to `RANGES_AT_ONCE` ranges, starting at `first`; a note stores the next range, if any."""
+        """Add up to `RANGES_AT_ONCE` ranges from `first`; with `goes_on`, note the next range, if any."""
         number = count_ranges(record.request.grasps, record.span)
         some = range(first, min(number, first + RANGES_AT_ONCE))
         self._upsert_tasks(connection, list(task_rows(record, some)))
@@ -399,7 +394,7 @@ class Changes(IndexPart):
         derive_states(connection, record.id, [number * record.span for number in some])
 
     def _requesting_projects(self, connection: Connection, ids: Sequence[str]) -> dict[str, str]:
-        """Map each shard to the project of the oldest job that requested it."""
+        """Map each requested shard to the project of the oldest job that requested it."""
         found: dict[str, str] = {}
         query = select(tasks.c.shard_id, jobs.c.project).join(jobs, jobs.c.id == tasks.c.job_id)
         oldest_first = query.order_by(jobs.c.created, jobs.c.id)
@@ -412,7 +407,7 @@ _OUTCOME = (shards.c.worker, shards.c.device, shards.c.seconds, shards.c.created
 
 
 def _outcome(worker: Any, device: Any, seconds: Any, created: Any) -> dict[str, Any]:
-    """Return the columns of a task row that follow from its shard; arguments are values or SQL columns."""
+    """Return the columns of a task row that follow from its shard, given as values or as SQL columns."""
     made = {"done": True, "worker": worker, "device": device, "seconds": seconds, "finished": created}
     return {**made, "reason": None, "queued": False, "not_before": 0.0, **NO_PROGRESS}
 
@@ -453,7 +448,7 @@ class DatasetChanges(IndexPart):
             upsert(connection, dataset_cells, cells)
 
     def set_events(self, name: str, events: Sequence[DatasetEvent], *, within: Connection | None = None) -> None:
-        """Apply all events of a dataset so far, the oldest first."""
+        """Apply the complete list of a dataset's events, oldest first."""
         cancelled = bool(events) and events[-1].what == "cancelled"
         number = max((event.number for event in events), default=0)
         values = {"cancelled": cancelled, "events": number, "planned": False}
@@ -461,14 +456,12 @@ class DatasetChanges(IndexPart):
             connection.execute(update(datasets).where(datasets.c.name == name).values(**values))
 
     def add_snapshot(self, snapshot: Snapshot, *, within: Connection | None = None) -> None:
-        plain = ("dataset", "digest", "created", "complete", "grasps", "valid", "size_bytes")
-        row = {name: getattr(snapshot, name) for name in plain} | {"shards": len(snapshot.shards)}
+        row = row_from(dataset_snapshots, snapshot, shards=len(snapshot.shards))
         with self.database.write_transaction(within) as connection:
             upsert(connection, dataset_snapshots, [row])
 
     def add_object_set(self, found: ObjectSet, *, within: Connection | None = None) -> None:
-        row = {name: getattr(found, name) for name in ("name", "digest", "created", "project")}
-        row |= {"objects": list(found.objects)}
+        row = row_from(object_sets, found, objects=list(found.objects))
         with self.database.write_transaction(within) as connection:
             upsert(connection, object_sets, [row])
 
@@ -492,7 +485,6 @@ class Live(IndexPart):
             update_rows(connection, tasks, rows, state=State.QUEUED.value)
             touched = sorted(set(jobs_of.values()))
             for some in chunks(touched):
-                # A running job stays running: its other tasks need no check.
                 of_waiting = update(jobs).where(jobs.c.id.in_(some), jobs.c.state == State.QUEUED.value)
                 connection.execute(of_waiting.values(state=running))
             return dict.fromkeys(touched, State.RUNNING)
@@ -513,7 +505,7 @@ class Live(IndexPart):
     def set_waiting(
         self, task_ids: Sequence[str], *, not_before: float = 0.0, message: str | None = None
     ) -> dict[str, State]:
-        """Mark tasks as not running, not in the queue and due at `not_before`; return their jobs' states."""
+        """Mark unfinished tasks as waiting until `not_before` [Unix time, s]; return their jobs' states."""
         values = {"queued": False, "not_before": not_before, "state": State.QUEUED.value, "worker": None}
         values |= {**NO_PROGRESS, "progress_message": message and sanitize(message)}
         touched: set[str] = set()
@@ -526,7 +518,7 @@ class Live(IndexPart):
     def set_asset_waiting(
         self, digests: Iterable[str], *, queued: bool, not_before: float = 0.0, message: str | None = None
     ) -> None:
-        """Set whether checks of assets are in the queue, when they are due, and the message if given."""
+        """Set whether checks of assets are in the queue, their due time [Unix time, s], and a given message."""
         values: dict[str, Any] = {"queued": queued, "not_before": not_before}
         if message is not None:
             values["message"] = sanitize(message)
@@ -534,7 +526,7 @@ class Live(IndexPart):
             connection.execute(update(assets).where(assets.c.digest.in_(list(digests))).values(**values))
 
     def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
-        """Record living workers; mark others as lost if last seen before `lost_before`; delete very old ones."""
+        """Record living workers; mark others as lost or delete them, according to their last report."""
         rows = [
             row_from(workers, beat, stages=[stage.value for stage in beat.stages], task_id=beat.task_id or None)
             for beat in beats

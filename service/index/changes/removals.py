@@ -29,7 +29,7 @@ class Removals(IndexPart):
     """`within` makes a read or write part of a larger transaction, so that checks still hold at the write."""
 
     def reason_to_keep_asset(self, asset: AssetView, *, within: Connection) -> str:
-        """Return what needs a hand, object or network, in a few words; empty if nothing needs it."""
+        """Describe a job, dataset or set that needs a hand, object or network; empty if there is none."""
         kind, digest = asset.kind, asset.digest
         column = f"{kind.value}_digest"
         if job := within.scalar(select(jobs.c.id).where(jobs.c[column] == digest).limit(1)):
@@ -43,14 +43,14 @@ class Removals(IndexPart):
                 return user
             newest = select(object_sets).order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
             rows = {row["name"]: row for row in within.execute(newest).mappings()}
-            # Sets of other projects can contain this object only if it is shared.
-            near = [row for row in rows.values() if asset.shared or row["project"] == asset.project]
-            if found := next((row["name"] for row in near if asset.name in row["objects"]), None):
-                return f"the set of objects {found!r}"
+            for row in rows.values():
+                # Sets of other projects can contain this object only if it is shared.
+                if (asset.shared or row["project"] == asset.project) and asset.name in row["objects"]:
+                    return f"the set of objects {row['name']!r}"
         return ""
 
     def reason_to_keep_job(self, job_id: str, *, within: Connection) -> str:
-        """Return why a job cannot be deleted, as words that follow `job ID`; empty if nothing prevents it."""
+        """Return why a job cannot be deleted, as text to follow `job ID`; empty if it can."""
         state = within.scalar(select(jobs.c.state).where(jobs.c.id == job_id))
         if state is None:
             raise NotFoundError(f"there is no job {job_id!r}")
@@ -68,14 +68,13 @@ class Removals(IndexPart):
         return int(within.scalar(query) or 0)
 
     def orphaned_dataset_jobs(self, ids: Sequence[str]) -> list[str]:
-        """Return the given jobs that were made for a dataset and are in no dataset now."""
+        """Return those of the given jobs that were planned for a dataset and are in no dataset now."""
         planned = (jobs.c.priority == Priority.BULK.value, jobs.c.origin.is_(None))
         needed = exists().where(dataset_cells.c.job_id == jobs.c.id)
-        query = select(jobs.c.id).where(jobs.c.id.in_(ids), *planned, ~needed)
-        return self.database.column(query)
+        return self.database.column(select(jobs.c.id).where(jobs.c.id.in_(ids), *planned, ~needed))
 
     def unneeded_shards(self, ids: Sequence[str]) -> set[str]:
-        """Return the existing shards among these ids that are the output of no task."""
+        """Return those of the given shards that exist and that no task produces."""
         query = select(shards.c.id).where(shards.c.id.in_(ids), ~exists().where(tasks.c.shard_id == shards.c.id))
         return set(self.database.column(query))
 
@@ -98,7 +97,7 @@ class Removals(IndexPart):
             connection.execute(delete(datasets).where(datasets.c.name == name))
 
     def remove_shard(self, shard: str, *, within: Connection) -> bool:
-        """Remove a shard with its grasps unless a task needs it; return whether its files can be deleted."""
+        """Remove a shard with its grasps unless a task produces it; return whether its files can be deleted."""
         if within.scalar(select(tasks.c.id).where(tasks.c.shard_id == shard).limit(1)) is not None:
             return False
         _remember_cost(shard, within)
@@ -108,6 +107,7 @@ class Removals(IndexPart):
 
 
 def _remember_cost(shard: str, connection: Connection) -> None:
+    """Add the cost of a shard to table `spent`; deleted results count as usage."""
     row = connection.execute(select(shards).where(shards.c.id == shard)).mappings().first()
     if row is None:
         return
@@ -122,7 +122,7 @@ def _remember_cost(shard: str, connection: Connection) -> None:
 
 
 def _reason_to_keep_neighbour(digest: str, connection: Connection) -> str:
-    """Return which job or dataset has an object among its neighbours, in a few words; empty if none has."""
+    """Describe a job or dataset that has the object as a neighbour; empty if there is none."""
     among = f"%{digest}%"
     # The first condition uses the index `jobs_beside`, so only jobs with neighbours are read.
     of_job = select(jobs.c.id).where(jobs.c.neighbours > "", jobs.c.neighbours.like(among)).limit(1)

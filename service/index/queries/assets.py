@@ -31,7 +31,7 @@ class Assets(IndexPart):
         refused: bool = False,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[AssetView]:
-        """Return a page of hands or objects, all versions, newest first; refused ones only on request."""
+        """Return a page of hands or objects in all versions, newest first; `refused` includes refused ones."""
         query = select(assets).where(assets.c.kind == kind.value, *asset_scope_conditions(scope))
         if not refused:
             query = query.where(_not_refused())
@@ -41,7 +41,7 @@ class Assets(IndexPart):
         return Page(items=[AssetView(**row) for row in rows], next=following)
 
     def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:
-        """Return an asset by digest or name: usable before refused, then own, then newest; else NotFoundError."""
+        """Return an asset by digest or name, if possible not refused, own, newest; NotFoundError if none."""
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
         refused_last = case((assets.c.verdict == "refuse", 1), else_=0)
@@ -55,10 +55,9 @@ class Assets(IndexPart):
 
     def sizes(self, kind: AssetKind, wanted: Collection[str], *, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
         """Return the sizes [bytes] of the named hands or objects; unknown names are omitted."""
-        query = select(assets.c.name, assets.c.size_bytes).where(
-            assets.c.kind == kind.value, *asset_scope_conditions(scope)
-        )
-        sizes = {row["name"]: row["size_bytes"] for row in self.database.rows(query.order_by(assets.c.created))}
+        query = select(assets.c.name, assets.c.size_bytes).order_by(assets.c.created)
+        query = query.where(assets.c.kind == kind.value, *asset_scope_conditions(scope))
+        sizes = {row["name"]: row["size_bytes"] for row in self.database.rows(query)}
         return {name: sizes[name] for name in wanted if name in sizes}
 
     def missing(self, wanted: Collection[tuple[AssetKind, str]], *, within: Connection) -> list[str]:

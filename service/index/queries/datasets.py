@@ -62,28 +62,21 @@ class Datasets(IndexPart):
             dataset = _dataset_row(connection, name, scope)
             now = _cell_state(dataset["cancelled"])
             planned = jobs.c.id.is_not(None).label("planned")
-            query = (
-                select(dataset_cells, now.label("state"), planned, jobs.c.reason, jobs.c.span)
-                .outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
-                .where(dataset_cells.c.dataset == name)
-            )
+            query = select(dataset_cells, now.label("state"), planned, jobs.c.reason, jobs.c.span)
+            query = query.outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id).where(dataset_cells.c.dataset == name)
             if state is not None:
                 query = query.where(now == state.value)
-            rows, following = page_rows(
-                connection, query, dataset_cells.c.position, limit=limit, cursor=cursor, descending=False
-            )
+            key = dataset_cells.c.position
+            rows, following = page_rows(connection, query, key, limit=limit, cursor=cursor, descending=False)
             views = _cell_views(connection, rows, JobOptions.model_validate(dataset["options"]))
         return Page(items=views, next=following)
 
     def shards(self, name: str) -> list[SnapshotShard]:
         """Return all shards of a dataset, ordered by cell, batch and stage."""
-        query = (
-            select(*(shards.c[field] for field in SnapshotShard.model_fields))
-            .join(tasks, tasks.c.shard_id == shards.c.id)
-            .join(dataset_cells, dataset_cells.c.job_id == tasks.c.job_id)
-            .where(dataset_cells.c.dataset == name)
-            .order_by(dataset_cells.c.position, tasks.c.batch, tasks.c.position)
-        )
+        query = select(*(shards.c[field] for field in SnapshotShard.model_fields))
+        query = query.join(tasks, tasks.c.shard_id == shards.c.id).where(dataset_cells.c.dataset == name)
+        query = query.join(dataset_cells, dataset_cells.c.job_id == tasks.c.job_id)
+        query = query.order_by(dataset_cells.c.position, tasks.c.batch, tasks.c.position)
         with self.database.read_transaction() as connection:
             _dataset_row(connection, name)
             return [SnapshotShard(**row) for row in connection.execute(query).mappings()]
@@ -110,8 +103,8 @@ def _dataset_row(connection: Connection, name: str, scope: ProjectScope = EVERYT
 
 
 def _cell_state(cancelled: bool) -> ColumnElement[str]:
-    """Return the state of a cell: its job's, or the dataset's if the cell has no job."""
-    # A literal, because PostgreSQL does not match an expression with a parameter to its GROUP BY.
+    """Return the state of a cell: that of its job, or without a job queued or cancelled."""
+    # A literal: PostgreSQL does not match an expression with parameters to the same expression in GROUP BY.
     unplanned = literal((State.CANCELLED if cancelled else State.QUEUED).value, literal_execute=True)
     return func.coalesce(jobs.c.state, unplanned)
 
@@ -146,27 +139,22 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
 def _state(row: Any, states: dict[State, int]) -> State:
     state = job_state(state for state, count in states.items() if count)
     if row["cancelled"]:
-        # A cancelled dataset has no pending work: its jobs stop, or continue for another dataset.
+        # Jobs of a cancelled dataset stop, or continue for another dataset.
         return state if state.is_final else State.CANCELLED
-    # An ended dataset is queued again until its jobs have received its last event, a retry.
+    # After a retry, a dataset counts as queued until its jobs have received that event.
     return State.QUEUED if state.is_final and row["applied"] < row["events"] else state
 
 
 def _states(connection: Connection, row: Any) -> dict[State, int]:
     now = _cell_state(row["cancelled"])
-    query = (
-        select(now, func.count())
-        .select_from(dataset_cells)
-        .outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
-        .where(dataset_cells.c.dataset == row["name"])
-        .group_by(now)
-    )
+    query = select(now, func.count()).select_from(dataset_cells).where(dataset_cells.c.dataset == row["name"])
+    query = query.outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id).group_by(now)
     found = {State(state): int(count) for state, count in connection.execute(query)}
     return {state: found.get(state, 0) for state in State}
 
 
 def _count_tasks_of_cell(options: JobOptions, span: int | None) -> int:
-    """Return the number of tasks of a cell; `span` is batches per task, None (used as 1) without a job."""
+    """Return the number of tasks of a cell; `span`: batches per task, None (used as 1) without a job."""
     return count_ranges(options.grasps, span or 1) * len(stages_of(options))
 
 
@@ -178,30 +166,21 @@ def _count_tasks_of_dataset(connection: Connection, name: str, options: JobOptio
 
 
 def _task_counts(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
-    query = (
-        select(
-            func.count().label("tasks"),
-            _count(tasks.c.state == State.SUCCEEDED.value).label("done"),
-            _count(tasks.c.state == State.FAILED.value).label("failed"),
-            _count(tasks.c.state == State.RUNNING.value).label("running"),
-            func.coalesce(func.sum(cast(SHARE_DONE, Float)), 0.0).label("share"),
-            func.max(tasks.c.finished).label("finished"),
-        )
-        .select_from(dataset_cells)
-        .join(tasks, tasks.c.job_id == dataset_cells.c.job_id)
-        .where(where)
+    query = select(
+        func.count().label("tasks"),
+        _sum_where(tasks.c.state == State.SUCCEEDED.value, 1).label("done"),
+        _sum_where(tasks.c.state == State.FAILED.value, 1).label("failed"),
+        _sum_where(tasks.c.state == State.RUNNING.value, 1).label("running"),
+        func.coalesce(func.sum(cast(SHARE_DONE, Float)), 0.0).label("share"),
+        func.max(tasks.c.finished).label("finished"),
     )
+    query = query.select_from(dataset_cells.join(tasks, tasks.c.job_id == dataset_cells.c.job_id)).where(where)
     return dict(connection.execute(query).mappings().one())
 
 
 def _grasp_counts(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
-    query = (
-        select(*_MADE)
-        .select_from(dataset_cells)
-        .join(tasks, tasks.c.job_id == dataset_cells.c.job_id)
-        .join(shards, shards.c.id == tasks.c.shard_id)
-        .where(where)
-    )
+    of_cells = dataset_cells.join(tasks, tasks.c.job_id == dataset_cells.c.job_id)
+    query = select(*_MADE).select_from(of_cells.join(shards, shards.c.id == tasks.c.shard_id)).where(where)
     return dict(connection.execute(query).mappings().one())
 
 
@@ -220,10 +199,8 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
         found = yields.get("valid" if options.counted == "valid" else "grasps", 0)
         reason = row["reason"]
         if row["state"] == State.SUCCEEDED.value and options.want == "valid" and found < options.grasps:
-            lost = outcomes_of(connection, tasks.c.job_id == job)
-            reason = explain_shortfall(
-                found, options.grasps, options.counted, yields.get("candidates", 0), options.budget, lost
-            )
+            rejected, candidates = outcomes_of(connection, tasks.c.job_id == job), yields.get("candidates", 0)
+            reason = explain_shortfall(found, options.grasps, options.counted, candidates, options.budget, rejected)
         views.append(
             CellView(
                 **{name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "choice")},
@@ -242,11 +219,8 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
 
 
 def _task_counts_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, float]]:
-    query = (
-        select(tasks.c.job_id, tasks.c.state, func.count(), func.sum(cast(SHARE_DONE, Float)))
-        .where(tasks.c.job_id.in_(ids))
-        .group_by(tasks.c.job_id, tasks.c.state)
-    )
+    query = select(tasks.c.job_id, tasks.c.state, func.count(), func.sum(cast(SHARE_DONE, Float)))
+    query = query.where(tasks.c.job_id.in_(ids)).group_by(tasks.c.job_id, tasks.c.state)
     found: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(int))
     for job, state, count, share in connection.execute(query):
         found[job][State(state)] += count
@@ -257,29 +231,19 @@ def _task_counts_by_job(connection: Connection, ids: Sequence[str]) -> dict[str,
 
 def _grasp_counts_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
     wanted = [column for column in _MADE if column.name in ("grasps", "valid", "candidates", "validated", "seconds")]
-    query = (
-        select(tasks.c.job_id, *wanted)
-        .join(shards, shards.c.id == tasks.c.shard_id)
-        .where(tasks.c.job_id.in_(ids))
-        .group_by(tasks.c.job_id)
-    )
+    query = select(tasks.c.job_id, *wanted).join(shards, shards.c.id == tasks.c.shard_id)
+    query = query.where(tasks.c.job_id.in_(ids)).group_by(tasks.c.job_id)
     return {row["job_id"]: {k: row[k] for k in row if k != "job_id"} for row in connection.execute(query).mappings()}
 
 
-def _count(condition: ColumnElement[bool]) -> ColumnElement[int]:
-    return func.coalesce(func.sum(case((condition, 1), else_=0)), 0)
-
-
-def _sum_over_base(column: ColumnElement[int]) -> ColumnElement[int]:
-    return func.coalesce(func.sum(case((_IS_BASE, column), else_=0)), 0)
+def _sum_where(condition: ColumnElement[bool], value: ColumnElement[int] | int) -> ColumnElement[int]:
+    return func.coalesce(func.sum(case((condition, value), else_=0)), 0)
 
 
 _MADE: Final = (
     func.count().label("shards"),
     func.coalesce(func.sum(shards.c.size_bytes), 0).label("size_bytes"),
     func.coalesce(func.sum(shards.c.seconds), 0.0).label("seconds"),
-    _sum_over_base(shards.c.count).label("grasps"),
-    _sum_over_base(shards.c.valid).label("valid"),
-    _sum_over_base(shards.c.candidates).label("candidates"),
-    _sum_over_base(shards.c.validated).label("validated"),
+    _sum_where(_IS_BASE, shards.c.count).label("grasps"),
+    *(_sum_where(_IS_BASE, shards.c[name]).label(name) for name in ("valid", "candidates", "validated")),
 )

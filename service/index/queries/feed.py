@@ -1,4 +1,4 @@
-"""Queries of the controller: tasks to queue, tasks marked as queued, cells of datasets to plan."""
+"""Queries of the controller: tasks to queue, tasks marked as queued, cells of datasets without a job."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from graspd.service.model.states import AssetKind, Priority, Stage, State
 
 @dataclass(frozen=True)
 class ReadyTask:
-    """Task that is ready to start, with the content of its message."""
+    """Task to queue, with the content of its message."""
 
     job: JobRecord
     task: PlannedTask
@@ -40,22 +40,16 @@ class ReadyCheck:
 
 class Feed(IndexPart):
     def waiting_jobs(self, priority: Priority, *, now: float) -> list[WaitingJob]:
-        due = _due(tasks.c.not_before, now)
-        waiting = exists().where(tasks.c.job_id == jobs.c.id, *_WAITING, due)
-        query = (
-            select(jobs.c.id, jobs.c.origin, jobs.c.project)
-            .where(
-                jobs.c.state.in_((State.QUEUED.value, State.RUNNING.value)), jobs.c.priority == priority.value, waiting
-            )
-            .order_by(jobs.c.created, jobs.c.id)
-        )
-        rows = self.database.rows(query)
-        return [
-            WaitingJob(row["id"], queue_owner(row["project"], (row["origin"] or {}).get("key", ""))) for row in rows
-        ]
+        """Return the jobs with a task to queue at `now` [Unix time, s], the oldest first."""
+        unfinished = jobs.c.state.in_((State.QUEUED.value, State.RUNNING.value))
+        waiting = exists().where(tasks.c.job_id == jobs.c.id, *_WAITING, _due(tasks.c.not_before, now))
+        query = select(jobs.c.id, jobs.c.origin, jobs.c.project).order_by(jobs.c.created, jobs.c.id)
+        rows = self.database.rows(query.where(unfinished, jobs.c.priority == priority.value, waiting))
+        keys = [(row["origin"] or {}).get("key", "") for row in rows]
+        return [WaitingJob(row["id"], queue_owner(row["project"], key)) for row, key in zip(rows, keys, strict=True)]
 
     def ready_tasks(self, priority: Priority, turns: RoundRobin, *, now: float, limit: int) -> list[ReadyTask]:
-        """Return at most `limit` tasks to queue: round-robin over projects or keys, then over their jobs."""
+        """Return at most `limit` tasks to queue, round-robin over projects or keys, then over their jobs."""
         of_key: dict[str, list[list[tuple[WaitingJob, ReadyTask]]]] = defaultdict(list)
         for job, share in turns.order(self.waiting_jobs(priority, now=now), limit):
             of_key[job.key].append([(job, task) for task in self.ready_tasks_of_job(job.id, limit=share, now=now)])
@@ -64,16 +58,11 @@ class Feed(IndexPart):
         return [task for _, task in chosen]
 
     def ready_tasks_of_job(self, job_id: str, *, limit: int, now: float | None = None) -> list[ReadyTask]:
-        """Return the first tasks of one job that are ready to queue; without `now`, ignore back-offs."""
+        """Return the first tasks of a job to queue; without `now`, back-offs are ignored."""
         due = () if now is None else (_due(tasks.c.not_before, now),)
-        query = (
-            select(tasks, *(jobs.c[name] for name in _OF_THE_JOB))
-            .join(jobs, jobs.c.id == tasks.c.job_id)
-            .where(tasks.c.job_id == job_id, *_WAITING, *due)
-            .order_by(tasks.c.batch)
-            .limit(limit)
-        )
-        rows = self.database.rows(query)
+        query = select(tasks, *(jobs.c[name] for name in _OF_THE_JOB)).join(jobs, jobs.c.id == tasks.c.job_id)
+        query = query.where(tasks.c.job_id == job_id, *_WAITING, *due).order_by(tasks.c.batch)
+        rows = self.database.rows(query.limit(limit))
         record = _record(rows[0]) if rows else None
         return [_ready_task(row, record) for row in rows if record is not None]
 
@@ -86,7 +75,7 @@ class Feed(IndexPart):
         ]
 
     def queued_tasks_and_checks(self) -> tuple[set[str], set[tuple[AssetKind, str]]]:
-        """Return unfinished tasks and checks of assets that the index marks as queued."""
+        """Return the unfinished tasks and asset checks that the index marks as queued."""
         unfinished = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
         of_tasks = select(tasks.c.id).where(tasks.c.ready.is_(True), tasks.c.queued.is_(True), unfinished)
         of_checks = select(assets.c.kind, assets.c.digest).where(assets.c.queued.is_(True), assets.c.verdict.is_(None))
@@ -118,20 +107,17 @@ _WAITING = (tasks.c.ready.is_(True), tasks.c.queued.is_(False))
 
 
 def _due(not_before: Column[float], now: float) -> ColumnElement[bool]:
-    # A wait longer than any back-off means that the clock was set back: the task is due at once.
+    # A due time further away than any back-off means that the clock was set back: the task is due at once.
     return or_(not_before <= now, not_before > now + 2 * MAX_BACKOFF_S)
 
 
 def _record(row: Any) -> JobRecord:
-    return JobRecord(
-        id=row["job_id"], **{name: row[name] for name in _OF_THE_JOB}, priority=row["priority"], created=row["created"]
-    )
+    return JobRecord(id=row["job_id"], **{name: row[name] for name in (*_OF_THE_JOB, "priority", "created")})
 
 
 def _ready_task(row: Any, record: JobRecord) -> ReadyTask:
-    task = PlannedTask(
-        row["id"], Stage(row["stage"]), row["batch"], row["count"], tuple(row["inputs"]), row["shard_id"]
-    )
+    stage, inputs = Stage(row["stage"]), tuple(row["inputs"])
+    task = PlannedTask(row["id"], stage, row["batch"], row["count"], inputs, row["shard_id"])
     return ReadyTask(record, task, Priority(row["priority"]), row["last_attempt"], row["retried_upto"])
 
 
@@ -150,11 +136,8 @@ class DatasetWork:
 class DatasetFeed(IndexPart):
     def pending_datasets(self) -> list[DatasetWork]:
         """Return datasets with cells to plan or with events for their jobs, the oldest first."""
-        query = (
-            select(datasets)
-            .where(or_(datasets.c.planned.is_(False), datasets.c.applied < datasets.c.events))
-            .order_by(datasets.c.created, datasets.c.name)
-        )
+        pending = or_(datasets.c.planned.is_(False), datasets.c.applied < datasets.c.events)
+        query = select(datasets).where(pending).order_by(datasets.c.created, datasets.c.name)
         plain = ("name", "revisions", "cancelled", "events", "applied", "owner", "project")
         return [
             DatasetWork(options=JobOptions.model_validate(row["options"]), **{name: row[name] for name in plain})
@@ -162,13 +145,10 @@ class DatasetFeed(IndexPart):
         ]
 
     def cells_to_plan(self, name: str, *, after: int, limit: int) -> list[Cell]:
-        query = (
-            select(dataset_cells)
-            .outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
-            .where(dataset_cells.c.dataset == name, dataset_cells.c.position > after, jobs.c.id.is_(None))
-            .order_by(dataset_cells.c.position)
-            .limit(limit)
-        )
+        """Return the next cells without a job, after position `after`."""
+        query = select(dataset_cells).outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
+        query = query.where(dataset_cells.c.dataset == name, dataset_cells.c.position > after, jobs.c.id.is_(None))
+        query = query.order_by(dataset_cells.c.position).limit(limit)
         return [
             Cell(
                 row["position"],
@@ -186,16 +166,12 @@ class DatasetFeed(IndexPart):
     ) -> list[tuple[int, str]]:
         """Return positions and jobs of the next cells in these states, after position `after`.
 
-        `unshared` omits jobs that another key submitted, and jobs that another uncancelled dataset needs.
+        `unshared` omits jobs submitted by another key, and jobs that another dataset in progress needs.
         """
-        query = (
-            select(dataset_cells.c.position, dataset_cells.c.job_id)
-            .join(jobs, jobs.c.id == dataset_cells.c.job_id)
-            .where(dataset_cells.c.dataset == name, dataset_cells.c.position > after)
-            .where(jobs.c.state.in_([state.value for state in states]))
-            .order_by(dataset_cells.c.position)
-            .limit(limit)
-        )
+        in_states = jobs.c.state.in_([state.value for state in states])
+        query = select(dataset_cells.c.position, dataset_cells.c.job_id)
+        query = query.join(jobs, jobs.c.id == dataset_cells.c.job_id).order_by(dataset_cells.c.position).limit(limit)
+        query = query.where(dataset_cells.c.dataset == name, dataset_cells.c.position > after, in_states)
         if unshared:
             query = query.join(datasets, datasets.c.name == dataset_cells.c.dataset)
             query = query.where(jobs.c.owner == datasets.c.owner)

@@ -1,13 +1,10 @@
 """Queries of grasps: filters, and pages sorted by a metric, among millions of rows.
 
-This module chooses the database index: SQLite has no statistics of the values, and scans a whole index for a rare
-match. There are three plans:
+This module chooses the database index, because SQLite has no statistics of the values. There are three plans:
 
 1. If a condition leaves few rows, they are fetched by its index and sorted.
 2. Otherwise a bounded number of rows is read in the wanted order until the page is full.
 3. If these rows do not fill the page, all rows are read once.
-
-`sql_condition` translates grasp expressions (`service.model.where`) to SQL.
 """
 
 from __future__ import annotations
@@ -18,21 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from pydantic import Field
-from sqlalchemy import (
-    ColumnElement,
-    Connection,
-    Float,
-    Select,
-    String,
-    Subquery,
-    and_,
-    exists,
-    func,
-    not_,
-    or_,
-    select,
-    tuple_,
-)
+from sqlalchemy import ColumnElement, Connection, Float, Select, String, Subquery, and_, func, not_, or_, select, tuple_
 from sqlalchemy.sql.operators import in_op, is_
 
 from graspd.service.index.database import (
@@ -55,6 +38,8 @@ from graspd.service.model.states import Stage
 from graspd.service.model.where import Connective, Flag, MetricComparison, Negation, Node, TypeComparison, parse_where
 
 Metric = SortedName
+#: Key of the grasp before a page (metric, shard id and row), None for the first page.
+Start = tuple[Any, ...] | None
 
 
 class GraspSort(Model):
@@ -94,16 +79,16 @@ class Grasps(IndexPart):
         return [(found["shard_id"], found["row"]) for found in self.database.rows(query.where(*sql_conditions(where)))]
 
     def get_many(self, wanted: Sequence[Grasp]) -> Iterator[GraspView]:
-        """Yield the given grasps, ordered by shard and row; missing grasps are omitted."""
+        """Yield the given grasps, ordered by shard and row, without missing ones."""
         for some in chunks(sorted(wanted)):
             query = select(grasps).where(tuple_(grasps.c.shard_id, grasps.c.row).in_(some))
             for row in self.database.rows(query.order_by(grasps.c.shard_id, grasps.c.row)):
                 yield GraspView(**row)
 
 
-#: Maximum number of rows to fetch by an index and sort; this is faster than a scan of a million rows.
+#: Maximum number of rows to fetch by an index and sort, which is faster than a scan of a million rows.
 SORTED_AT_ONCE: Final = 40_000
-#: Rows read in the wanted order: few at first, since most filters fill a page from them.
+#: Numbers of rows to read in the wanted order: few at first, because these suffice for most filters.
 LOOKED_AT: Final = (1000, 20_000)
 #: Columns by name, of the table of grasps or of a subquery.
 Columns = Any
@@ -128,7 +113,7 @@ _FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
 
 @dataclass(frozen=True)
 class Condition:
-    """Test of one column. Conditions of one group share one index."""
+    """Comparison of one column with a value. Conditions of one group share one database index."""
 
     group: str
     column: ColumnElement[Any]
@@ -136,7 +121,7 @@ class Condition:
     value: Any
 
     def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
-        """Return the test, without use of an index if its group is not in `groups` (None means all groups)."""
+        """Return the test in SQL, which uses an index only if its group is in `groups` (None: all groups)."""
         return self._of(self.column if groups is None or self.group in groups else _without_index(self.column))
 
     def sql_for_rows(self, rows: Subquery) -> ColumnElement[bool]:
@@ -163,7 +148,7 @@ class Tagged:
 
     def _of(self, columns: Any) -> ColumnElement[bool]:
         same = (tagged.c.tag == self.tag, tagged.c.shard_id == columns.shard_id, tagged.c.row == columns.row)
-        return exists().where(*same)
+        return select(tagged.c.tag).where(*same).exists()
 
 
 @dataclass(frozen=True)
@@ -184,7 +169,7 @@ Test = Condition | Tagged | ExpressionCondition
 
 
 def conditions(where: GraspFilter | None) -> list[Test]:
-    """Return the tests of a filter, all of which must be true; InputError for an invalid expression."""
+    """Return the tests of a filter, all of which must hold; InputError for an invalid expression."""
     where = where or GraspFilter()
     found: list[Test] = []
     if where.job is not None:
@@ -225,10 +210,8 @@ def sql_conditions(where: GraspFilter | None) -> list[ColumnElement[bool]]:
     return [condition.sql(None) for condition in conditions(where)]
 
 
-def search(
-    connection: Connection, where: GraspFilter | None, sort: GraspSort, size: int, start: tuple[Any, ...] | None
-) -> list[Any]:
-    """Return the first `size` rows after `start`: metric, shard id and row of the previous grasp."""
+def search(connection: Connection, where: GraspFilter | None, sort: GraspSort, size: int, start: Start) -> list[Any]:
+    """Return the first `size` rows after `start`."""
     wanted = conditions(where)
     few = _selective_group(connection, where, wanted)
     rows: list[Any] = []
@@ -245,17 +228,12 @@ def search(
 
 
 def _with_metric(
-    connection: Connection,
-    wanted: Sequence[Test],
-    few: str | None,
-    sort: GraspSort,
-    size: int,
-    start: tuple[Any, ...] | None,
+    connection: Connection, wanted: Sequence[Test], few: str | None, sort: GraspSort, size: int, start: Start
 ) -> list[Any]:
     by = grasps.c[sort.by]
     if few is not None and few != sort.by:
         return _sorted_rows(connection, [c.sql([few]) for c in wanted], sort, size, start)
-    # The index that gives the order also serves conditions on its metric and, for epsilon, on hand and object.
+    # The database index of the order also serves conditions on its metric and, for epsilon, on hand and object.
     served = [sort.by, "pair"] if sort.by == "epsilon" else [sort.by]
     inside = [c.sql(served) for c in wanted if c.group in served]
     outside = [c for c in wanted if c.group not in served]
@@ -266,21 +244,17 @@ def _with_metric(
     for number in LOOKED_AT:
         looked = _slice(ordered, key, sort, number, start).subquery()
         query = select(looked).where(*(c.sql_for_rows(looked) for c in outside))
-        same_key = tuple(looked.c[str(column.key)] for column in key)
-        rows = list(connection.execute(_slice(query, same_key, sort, size, None)).mappings())
+        looked_key = tuple(looked.c[str(column.key)] for column in key)
+        rows = list(connection.execute(_slice(query, looked_key, sort, size, None)).mappings())
         if len(rows) >= size or _count(connection, looked) < number:
             return rows
-    # PostgreSQL can join indexes; SQLite would follow one index row by row, which is slower than a full scan.
+    # PostgreSQL combines indexes; SQLite would follow a single one row by row, which is slower than a full scan.
     groups: list[str] | None = None if connection.dialect.name == "postgresql" else []
     return _sorted_rows(connection, [c.sql(groups) for c in wanted], sort, size, start)
 
 
 def _sorted_rows(
-    connection: Connection,
-    tests: Sequence[ColumnElement[bool]],
-    sort: GraspSort,
-    size: int,
-    start: tuple[Any, ...] | None,
+    connection: Connection, tests: Sequence[ColumnElement[bool]], sort: GraspSort, size: int, start: Start
 ) -> list[Any]:
     """Return the matching rows, sorted without an index."""
     by = _without_index(grasps.c[sort.by])
@@ -294,7 +268,7 @@ def _selective_group(connection: Connection, where: GraspFilter | None, wanted: 
     for group in dict.fromkeys(condition.group for condition in wanted):
         if group != "flag":
             numbers[group] = estimate_row_count(connection, where or GraspFilter(), group, wanted)
-    few = min(numbers, key=lambda name: numbers[name], default=None)
+    few = min(numbers, key=numbers.__getitem__, default=None)
     return few if few is not None and numbers[few] <= SORTED_AT_ONCE else None
 
 
@@ -302,9 +276,8 @@ def estimate_row_count(connection: Connection, where: GraspFilter, group: str, w
     """Estimate the rows that match a group of conditions; for metrics, count at most `SORTED_AT_ONCE` + 1."""
     query: Select[Any]
     if group == "job":
-        query = select(func.sum(tasks.c.count)).where(
-            tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value
-        )
+        of_job = (tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value)
+        query = select(func.sum(tasks.c.count)).where(*of_job)
     elif group == "project":
         query = _tasks_of_project(where.project or "").with_only_columns(func.sum(tasks.c.count))
     elif group == "dataset":
@@ -336,7 +309,7 @@ def _count(connection: Connection, rows: Subquery) -> int:
 
 
 def _slice(
-    query: Select[Any], key: tuple[ColumnElement[Any], ...], sort: GraspSort, size: int, start: tuple[Any, ...] | None
+    query: Select[Any], key: tuple[ColumnElement[Any], ...], sort: GraspSort, size: int, start: Start
 ) -> Select[Any]:
     if start is not None:
         position = tuple_(*key)
@@ -351,7 +324,7 @@ def _without_index(column: ColumnElement[Any]) -> ColumnElement[Any]:
 
 
 def sql_condition(node: Node, grasps: Columns) -> ColumnElement[bool]:
-    """Translate an expression to never-NULL SQL, so `not` inverts it; InputError for a missing column."""
+    """Translate a grasp expression to SQL that is never NULL; InputError for a missing column."""
     if isinstance(node, Connective):
         return (or_ if node.word == "or" else and_)(*(sql_condition(part, grasps) for part in node.parts))
     if isinstance(node, Negation):
@@ -378,7 +351,7 @@ def _missing_column_error(name: str) -> InputError:
 
 
 class GraspFilter(Model):
-    """Conjunction of filters; `at_least` and `at_most` are inclusive metric bounds; missing values fail."""
+    """Filters, all of which must match; `at_least` and `at_most` are inclusive bounds of metrics."""
 
     hand: str | None = None
     object: str | None = None

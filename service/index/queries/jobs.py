@@ -100,35 +100,29 @@ def _job_views(connection: Connection, rows: Sequence[Any]) -> list[JobView]:
 
 
 def _with_pending_tasks(stage: StageProgress, tasks: int) -> StageProgress:
-    """Add the tasks of a large job that are not yet entered."""
+    """Count the tasks of a large job that the index does not have yet as queued."""
     more = max(0, tasks - stage.tasks)
     return stage.model_copy(update={"tasks": stage.tasks + more, "queued": stage.queued + more}) if more else stage
 
 
 def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[StageProgress]]:
-    # A shard that is older than its task was reused; both times are texts of one format.
+    # The shard of a task is reused if it is older than the task; both times are texts of one format.
     reused = and_(tasks.c.done, tasks.c.finished < tasks.c.created)
-    query = (
-        select(
-            tasks.c.job_id,
-            tasks.c.position,
-            tasks.c.stage,
-            tasks.c.state,
-            func.count().label("tasks"),
-            func.sum(cast(SHARE_DONE, Float)).label("done"),
-            func.sum(case((reused, 0.0), else_=func.coalesce(tasks.c.seconds, 0.0))).label("seconds"),
-            func.sum(case((reused, 1), else_=0)).label("reused"),
-        )
-        .where(tasks.c.job_id.in_(ids))
-        .group_by(tasks.c.job_id, tasks.c.position, tasks.c.stage, tasks.c.state)
+    group = (tasks.c.job_id, tasks.c.position, tasks.c.stage, tasks.c.state)
+    query = select(
+        *group,
+        func.count().label("tasks"),
+        func.sum(cast(SHARE_DONE, Float)).label("done"),
+        func.sum(case((reused, 0.0), else_=func.coalesce(tasks.c.seconds, 0.0))).label("seconds"),
+        func.sum(case((reused, 1), else_=0)).label("reused"),
     )
+    query = query.where(tasks.c.job_id.in_(ids)).group_by(*group)
     stages: dict[str, dict[int, dict[str, Any]]] = defaultdict(dict)
     for row in connection.execute(query).mappings():
-        stage = stages[row["job_id"]].setdefault(
-            row["position"], {"stage": row["stage"], "tasks": 0, "done": 0.0, "seconds": 0.0, "reused": 0}
-        )
+        sums = {"tasks": 0, "done": 0.0, "seconds": 0.0, "reused": 0}
+        stage = stages[row["job_id"]].setdefault(row["position"], {"stage": row["stage"], **sums})
         stage[row["state"]] = row["tasks"]
-        for name in ("tasks", "done", "seconds", "reused"):
+        for name in sums:
             stage[name] += row[name]
     return {job: [StageProgress(**stages[job][position]) for position in sorted(stages[job])] for job in ids}
 
@@ -136,12 +130,9 @@ def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[Stag
 def _grasp_counts(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, int]]:
     same = ("valid", "candidates", "validated", "rechecked", "recheck_held")
     columns = {"grasps": "count", **{name: name for name in same}}
-    query = (
-        select(tasks.c.job_id, *(func.sum(shards.c[column]).label(name) for name, column in columns.items()))
-        .join(shards, shards.c.id == tasks.c.shard_id)
-        .where(tasks.c.job_id.in_(ids), tasks.c.stage == Stage.SYNTHESIZE.value)
-        .group_by(tasks.c.job_id)
-    )
+    sums = (func.sum(shards.c[column]).label(name) for name, column in columns.items())
+    query = select(tasks.c.job_id, *sums).join(shards, shards.c.id == tasks.c.shard_id).group_by(tasks.c.job_id)
+    query = query.where(tasks.c.job_id.in_(ids), tasks.c.stage == Stage.SYNTHESIZE.value)
     rows = connection.execute(query).mappings()
     return {row["job_id"]: {name: int(row[name]) for name in columns} for row in rows}
 
@@ -152,18 +143,14 @@ def _task_view(row: Any) -> TaskView:
     return TaskView.model_validate({**row, **progress, "attempt": attempt})
 
 
-#: Maximum number of shards to read: enough to show the reasons, and few enough for a fast page.
+#: Maximum number of shards to read for outcomes, which keeps a page fast.
 MOST_SHARDS: Final = 1000
 
 
 def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[str, int]:
     """Count rejected candidates by outcome in at most `MOST_SHARDS` shards of the selected jobs."""
-    query = (
-        select(shards.c.manifest["info"]["outcomes"])
-        .join(tasks, tasks.c.shard_id == shards.c.id)
-        .where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value)
-        .limit(MOST_SHARDS)
-    )
+    query = select(shards.c.manifest["info"]["outcomes"]).join(tasks, tasks.c.shard_id == shards.c.id)
+    query = query.where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value).limit(MOST_SHARDS)
     return sum_outcomes(one for one in connection.scalars(query) if isinstance(one, dict))
 
 
@@ -178,9 +165,8 @@ class Shards(IndexPart):
         scope: ProjectScope = EVERYTHING,
     ) -> Page[ShardView]:
         """Return a page of shards, newest first, without their manifests."""
-        query = select(shards).where(
-            *shard_scope_conditions(scope, shards.c.id), *_equality_conditions({shards.c.kind: kind})
-        )
+        query = select(shards).where(*shard_scope_conditions(scope, shards.c.id))
+        query = query.where(*_equality_conditions({shards.c.kind: kind}))
         if job is not None:
             query = query.where(shards.c.id.in_(select(tasks.c.shard_id).where(tasks.c.job_id == job)))
         with self.database.read_transaction() as connection:
@@ -194,10 +180,8 @@ class Shards(IndexPart):
 
     def job_of(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> str | None:
         """Return a job in scope that requested this shard; None if the index has none."""
-        query = (
-            select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *scope_conditions_by_job(scope, tasks)).limit(1)
-        )
-        found: str | None = self.database.value(query)
+        query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *scope_conditions_by_job(scope, tasks))
+        found: str | None = self.database.value(query.limit(1))
         return found
 
     def get(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> ShardView:

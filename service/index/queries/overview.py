@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Select, Table, case, func, select
@@ -20,7 +19,7 @@ from graspd.service.index.database import (
 )
 from graspd.service.index.tables import attempts, damage, jobs, shards, spent, tasks, workers
 from graspd.service.index.views import FailureGroup, MatrixCell, Stats, UsageDay, WorkerView
-from graspd.service.model.clock import age_of
+from graspd.service.model.clock import age_of, timestamp
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.names import SHARD_KINDS
 from graspd.service.model.projects import EVERYTHING, ProjectScope
@@ -35,9 +34,8 @@ class Overview(IndexPart):
     def stats(self, *, scope: ProjectScope = EVERYTHING) -> Stats:
         alive = select(func.count()).select_from(workers).where(workers.c.state != "lost")
         sums = (func.count(), *_MADE, func.sum(shards.c.size_bytes))
-        by_kind = (
-            select(shards.c.kind, *sums).where(*shard_scope_conditions(scope, shards.c.id)).group_by(shards.c.kind)
-        )
+        by_kind = select(shards.c.kind, *sums).group_by(shards.c.kind)
+        by_kind = by_kind.where(*shard_scope_conditions(scope, shards.c.id))
         with self.database.read_transaction() as connection:
             of_jobs = _counts_by_state(connection, jobs, *scope_conditions(scope, jobs))
             of_tasks = _counts_by_state(connection, tasks, *scope_conditions_by_job(scope, tasks))
@@ -59,31 +57,18 @@ class Overview(IndexPart):
     def valid_per_minute(self, *, since: str, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
         """Return the number of valid grasps per minute (2026-11-22T08:30) since a time, without empty minutes."""
         minute = func.substr(shards.c.created, 1, 16)
+        recent = (shards.c.kind == "base", shards.c.created >= since)
         query = select(minute, func.sum(shards.c.valid)).group_by(minute)
-        query = query.where(
-            shards.c.kind == "base", shards.c.created >= since, *shard_scope_conditions(scope, shards.c.id)
-        )
+        query = query.where(*recent, *shard_scope_conditions(scope, shards.c.id))
         with self.database.read_transaction() as connection:
             return {start: int(valid) for start, valid in connection.execute(query)}
 
     def failures(self, *, limit: int = 20, scope: ProjectScope = EVERYTHING) -> list[FailureGroup]:
-        """Return failed attempts by stage and error, the most frequent first."""
-        count, newest = func.count(), func.max(attempts.c.ended)
-        in_scope = scope_conditions_by_job(scope, attempts)
-        of_tasks = func.count(attempts.c.task_id.distinct())
-        query = (
-            select(
-                attempts.c.stage,
-                attempts.c.kind,
-                count.label("attempts"),
-                of_tasks.label("tasks"),
-                newest.label("last_seen"),
-            )
-            .where(*in_scope)
-            .group_by(attempts.c.stage, attempts.c.kind)
-            .order_by(count.desc(), newest.desc())
-            .limit(page_size(limit))
-        )
+        """Return failed attempts grouped by stage and error, the most frequent first."""
+        number, newest = func.count().label("attempts"), func.max(attempts.c.ended).label("last_seen")
+        in_scope, group = scope_conditions_by_job(scope, attempts), (attempts.c.stage, attempts.c.kind)
+        query = select(*group, number, func.count(attempts.c.task_id.distinct()).label("tasks"), newest)
+        query = query.where(*in_scope).group_by(*group).order_by(number.desc(), newest.desc()).limit(page_size(limit))
         groups = []
         with self.database.read_transaction() as connection:
             for row in connection.execute(query).mappings().all():
@@ -95,11 +80,8 @@ class Overview(IndexPart):
 
     def matrix(self, *, scope: ProjectScope = EVERYTHING) -> list[MatrixCell]:
         of_tasks = select(tasks.c.job_id, tasks.c.state, func.count()).group_by(tasks.c.job_id, tasks.c.state)
-        made = (
-            select(shards.c.hand, shards.c.object, *_MADE)
-            .where(shards.c.kind == "base", *shard_scope_conditions(scope, shards.c.id))
-            .group_by(shards.c.hand, shards.c.object)
-        )
+        made = select(shards.c.hand, shards.c.object, *_MADE).group_by(shards.c.hand, shards.c.object)
+        made = made.where(shards.c.kind == "base", *shard_scope_conditions(scope, shards.c.id))
         cells: dict[tuple[str, str], dict[str, int]] = {}
         with self.database.read_transaction() as connection:
             pairs = {}
@@ -117,12 +99,7 @@ class Overview(IndexPart):
 
 
 _CELL: Final = ("jobs", "queued", "running", "failed", "grasps", "valid", "candidates", "validated")
-_MADE = (
-    func.sum(shards.c.count),
-    func.sum(shards.c.valid),
-    func.sum(shards.c.candidates),
-    func.sum(shards.c.validated),
-)
+_MADE = tuple(func.sum(shards.c[name]) for name in ("count", "valid", "candidates", "validated"))
 
 
 def _counts_by_state(connection: Connection, table: Table, *tests: ColumnElement[bool]) -> dict[State, int]:
@@ -138,19 +115,18 @@ UNFINISHED: Final = (State.QUEUED, State.RUNNING)
 
 @dataclass(frozen=True)
 class IndexStatus:
-    """Unfinished jobs, and the grasps made in the last minute."""
+    """Unfinished jobs, age [s] of the oldest, grasps per second in the last minute, and damage."""
 
     jobs: Mapping[State, int]
     oldest_s: Mapping[State, float]
     grasps_per_s: float
     valid_per_s: float
     damaged: int
-    """Stored objects with known damage, counted up to `MOST_JOBS`."""
+    """Number of stored objects with known damage, at most `MOST_JOBS`."""
 
 
 def read_index(database: Database) -> IndexStatus:
-    """Count unfinished jobs, grasps of the last minute and damage; find the oldest job of each state."""
-    since = datetime.now(UTC) - timedelta(seconds=RATE_WINDOW_S)
+    """Return the status of an index for the metrics."""
     counted, oldest = {}, {}
     with database.read_transaction() as connection:
         for state in UNFINISHED:
@@ -159,7 +135,7 @@ def read_index(database: Database) -> IndexStatus:
             oldest[state] = (first and age_of(first)) or 0.0
         some = select(damage.c.key).limit(MOST_JOBS).subquery()
         damaged = int(connection.scalar(select(func.count()).select_from(some)) or 0)
-        made, valid = connection.execute(grasp_count_query(since)).one()
+        made, valid = connection.execute(grasp_count_query(timestamp(RATE_WINDOW_S))).one()
     return IndexStatus(counted, oldest, int(made or 0) / RATE_WINDOW_S, int(valid or 0) / RATE_WINDOW_S, damaged)
 
 
@@ -172,9 +148,8 @@ def oldest_job_query(state: State) -> Select[Any]:
     return select(jobs.c.created).where(jobs.c.state == state.value).order_by(jobs.c.created).limit(1)
 
 
-def grasp_count_query(when: datetime) -> Select[Any]:
-    text = when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
-    base = (shards.c.kind == "base", shards.c.created >= text)
+def grasp_count_query(since: str) -> Select[Any]:
+    base = (shards.c.kind == "base", shards.c.created >= since)
     return select(func.sum(shards.c.count), func.sum(shards.c.valid)).where(*base)
 
 
@@ -182,13 +157,8 @@ class Usage(IndexPart):
     def days(self, since: str, until: str, *, scope: ProjectScope = EVERYTHING) -> list[UsageDay]:
         """Return the usage of each project by day (2026-11-22), without empty days, newest first."""
         day = func.substr(shards.c.created, 1, 10).label("day")
-        sums = (
-            _sum_over_base(shards.c.count),
-            _sum_over_base(shards.c.valid),
-            func.count(),
-            func.sum(shards.c.seconds),
-        )
-        made = select(shards.c.charged, day, shards.c.device, *sums)
+        base = (_sum_over_base(column) for column in (shards.c.count, shards.c.valid))
+        made = select(shards.c.charged, day, shards.c.device, *base, func.count(), func.sum(shards.c.seconds))
         made = made.where(shards.c.created >= since, shards.c.created < f"{until}T99")
         gone = select(spent).where(spent.c.day >= since, spent.c.day <= until, *scope_conditions(scope, spent))
         if not scope.everything:
@@ -203,15 +173,14 @@ class Usage(IndexPart):
                 found["tasks"] += int(tasks)
                 found["gpu_seconds" if device.startswith("cuda") else "cpu_seconds"] += float(seconds)
         views = []
-        for (when, project), found in sorted(
-            days.items(), key=lambda item: (-int(item[0][0].replace("-", "")), item[0][1])
-        ):
+        for when, project in sorted(days, key=lambda key: (-int(key[0].replace("-", "")), key[1])):
+            found = days[when, project]
             seconds = {name: round(float(found[name]), 3) for name in ("gpu_seconds", "cpu_seconds")}
             views.append(UsageDay(project=project, day=when, **{**found, **seconds}))
         return views
 
     def gpu_seconds(self, project: str, day: str) -> float:
-        """Return the time [s] of GPU workers for a project's requests on one day."""
+        """Return the time [s] of GPU workers for the requests of a project on a day (2026-11-22)."""
         return sum(one.gpu_seconds for one in self.days(day, day, scope=ProjectScope(project, everything=False)))
 
 
@@ -222,13 +191,13 @@ def _sum_over_base(column: ColumnElement[Any]) -> ColumnElement[Any]:
 _USED: Final = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
 
 
-#: Maximum number of tasks read per stage, newest first; older measurements are ignored.
+#: Maximum number of tasks per stage whose costs are read, newest first.
 _NEWEST: Final = 2000
 
 
 @dataclass(frozen=True)
 class BatchCost:
-    """Finished batches of a task: request, cost and result."""
+    """Finished batches of a task: request, worker time [s], result and size."""
 
     hand: str
     object: str
@@ -250,11 +219,7 @@ class BatchCost:
 class Costs(IndexPart):
     def of_batches(self, stage: Stage, *, limit: int = _NEWEST, scope: ProjectScope = EVERYTHING) -> list[BatchCost]:
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
-        query = (
-            select(*columns, shards.c.manifest["request"].label("request"))
-            .where(shards.c.kind == SHARD_KINDS[stage], *shard_scope_conditions(scope, shards.c.id))
-            .order_by(shards.c.created.desc(), shards.c.id.desc())
-            .limit(limit)
-        )
-        rows = self.database.rows(query)
+        query = select(*columns, shards.c.manifest["request"].label("request"))
+        query = query.where(shards.c.kind == SHARD_KINDS[stage], *shard_scope_conditions(scope, shards.c.id))
+        rows = self.database.rows(query.order_by(shards.c.created.desc(), shards.c.id.desc()).limit(limit))
         return [BatchCost(**{**row, "request": JobRequest.model_validate(row["request"])}) for row in rows]

@@ -1,10 +1,8 @@
 """Seconds and bytes of a batch: measured on finished batches of this service, else stored values.
 
-The nearest measurement counts: of the same hand and object, else of the same hand, else of any hand. Method, fidelity,
-validator and kind of device are always the same. `STORED` and `STORED_METHODS` have the stored values with their
-origin. After the first measurement, one factor (seconds of this machine / stored seconds) scales all stored values.
-Comparisons of fidelities thus never mix two machines. Every rate has an interval: the scatter of measured batches, or
-the observed error of a stored value.
+The nearest measurement counts: of the same hand and object, else of the same hand, else of any hand; always with the
+same method, fidelity, validation and device. After the first measurement, one factor (seconds on this machine / stored
+seconds) scales all stored values. A rate's interval is the scatter of batches, or the error of a stored value.
 """
 
 from __future__ import annotations
@@ -22,14 +20,14 @@ from graspd.service.model.scene_spec import TOUCH
 
 @dataclass(frozen=True)
 class Rate:
-    """Cost of grasps with the same options, and its origin."""
+    """Cost of grasps with the same options, its origin and interval."""
 
     seconds_per_try: float
     valid_yield: float
     bytes_per_grasp: float
     origin: str
     batches: int
-    """Finished batches of the measurement; 0 for stored values."""
+    """Number of finished batches that were measured; 0 for stored values."""
     spread: tuple[float, float]
     """Lower and upper factor on the seconds."""
 
@@ -39,22 +37,21 @@ class Machine:
     """Speed of this machine relative to the stored numbers."""
 
     factor: float = 1.0
-    """Ratio of seconds here to stored seconds: median over all batches."""
+    """Median over all batches of the ratio of seconds on this machine to stored seconds."""
     spread: tuple[float, float] = (1.0, 1.0)
     """Interval of single batches, as factors of the median."""
     batches: int = 0
-    """Finished batches of the comparison; 0 if the factor is unknown."""
+    """Number of compared batches; 0 if the factor is unknown."""
 
     @property
     def stored_spread(self) -> tuple[float, float]:
-        """Lower and upper factor on a stored number on this machine."""
+        """Lower and upper factor on stored seconds on this machine."""
         low, high = SCALED_SPREAD if self.batches else STORED_SPREAD
         return low * self.spread[0], high * self.spread[1]
 
     def scaled_origin(self, origin: str) -> str:
-        if not self.batches:
-            return origin
-        return f"{origin}, x {self.factor:.2g}, measured here (batches: {self.batches})"
+        scale = f", x {self.factor:.2g}, measured here (batches: {self.batches})"
+        return origin + scale if self.batches else origin
 
 
 @dataclass(frozen=True)
@@ -71,18 +68,16 @@ class StageRate:
 
 #: Narrowest interval of a measured rate: the observed difference between two runs of the same batches.
 MEASURED_SPREAD: Final = (0.8, 1.25)
-#: Interval of a stored rate on a machine with a known factor: fidelities and methods scale differently.
+#: Interval of a stored rate on a machine with a known factor, because fidelities and methods scale differently.
 SCALED_SPREAD: Final = (0.5, 2.0)
-#: Interval of a stored rate on an unknown machine: a small shared machine was ten times as slow.
+#: Interval of a stored rate on an unknown machine; a small shared machine was ten times as slow.
 STORED_SPREAD: Final = (1 / 3, 10.0)
-#: Origin of the stored numbers: CPU times and sizes of graspd 0.1, for a worker that keeps two cores busy for nine
-#: tenths of the time; see docs/explanation/scaling.md.
+#: Origin of the stored numbers: graspd 0.1, for a worker that keeps two CPU cores busy for 90 % of the time.
 ORIGIN: Final = "stored default: 2 CPU cores, docs/explanation/scaling.md"
-#: Seconds per candidate (with postures, quality and verdict) and valid yield. All have the yield of `standard`:
-#: 1,785 of 2,542 candidates.
+#: Seconds per candidate (with postures, metrics and validation), and yield: that of `standard`, 1,785 of 2,542.
 STORED: Final[dict[str, tuple[float, float]]] = {"draft": (0.13, 0.7), "standard": (0.16, 0.7), "fine": (0.24, 0.7)}
-#: Seconds per candidate and yield of other methods at their published budget: time and success of the planner from
-#: docs/results/chart.md, plus the cost of postures, quality and verdict.
+#: The same of other methods at their published budget: time and success of the planner (docs/results/chart.md), plus
+#: postures, metrics and validation.
 STORED_METHODS: Final[dict[str, tuple[float, float]]] = {
     "graspit": (1.5, 0.2),
     "graspd2022": (0.75, 0.4),
@@ -91,20 +86,19 @@ STORED_METHODS: Final[dict[str, tuple[float, float]]] = {
 }
 _BYTES_PER_GRASP: Final = 1338.0
 STORED_SCENE: Final = StageRate(0.5, 240.0, ORIGIN, 0)
-#: Seconds and bytes of a scene in which grasps are then planned; `STORED_SCENE` is for existing grasps.
+#: Cost of a scene in which grasps are planned; `STORED_SCENE` applies to transfers of existing grasps.
 STORED_PLACE: Final = StageRate(0.5, 2200.0, ORIGIN, 0)
-#: Cost of a candidate in a scene relative to a free object, and its valid share: values of built-in hands and objects
-#: on tables, to within a factor of four.
+#: Seconds per candidate in a scene relative to a free object, and yield, for built-in hands and objects on tables; true
+#: values differ by up to a factor of four.
 STORED_IN_SCENE: Final = (1.6, 0.5)
-#: Seconds per valid grasp and perturbed model on two cores: 25 to 70 core-ms, for a lift 44 to 59
-#: (docs/results/robust.md). All models count, because few tests end early.
+#: Seconds per valid grasp and perturbed model on two cores (docs/results/robust.md); few tests end early.
 STORED_MODEL_S: Final = 0.018
 STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
 
 
 class Rates:
     def __init__(self, batches: Iterable[BatchCost], options: JobOptions, devices: Collection[str]) -> None:
-        """Select `synthesize` batches of these options and devices (empty: all). Group by hand and object."""
+        """Group the `synthesize` batches of these options and devices (empty: all) by hand and object."""
         self._options = options
         self._groups: dict[Hashable, list[BatchCost]] = defaultdict(list)
         recipe = recipe_of(options)
@@ -117,6 +111,7 @@ class Rates:
         self._known: dict[Hashable, Rate] = {}
 
     def of(self, hand: str, obj: str) -> Rate:
+        """Return the rate of the nearest measurement, else the stored rate."""
         levels: tuple[tuple[Hashable, str], ...] = (
             ((hand, obj), f"{hand} on {obj}"),
             (hand, f"{hand} on other objects"),
@@ -144,10 +139,8 @@ class Rates:
 
     def _stored_rate(self) -> Rate:
         seconds, share, origin = _stored_rates(self._options)
-        machine = self.machine
-        return Rate(
-            seconds * machine.factor, share, _BYTES_PER_GRASP, machine.scaled_origin(origin), 0, machine.stored_spread
-        )
+        origin, factor = self.machine.scaled_origin(origin), self.machine.factor
+        return Rate(seconds * factor, share, _BYTES_PER_GRASP, origin, 0, self.machine.stored_spread)
 
 
 def expected_candidates(rate: Rate, options: JobOptions) -> float:
@@ -159,15 +152,14 @@ def expected_candidates(rate: Rate, options: JobOptions) -> float:
 
 
 def _stored_rates(options: JobOptions) -> tuple[float, float, str]:
-    """Return the stored seconds per candidate, yield and origin."""
+    """Return stored seconds per candidate, yield and origin."""
     if options.models:
         plain = options.model_copy(update={"robust": 0.0, "robust_models": 0})
         seconds, share, origin = _stored_rates(plain)
         return seconds + share * options.models * STORED_MODEL_S, share, f"{origin}, and {options.models} models"
     if options.in_scene:
-        seconds, _, origin = _stored_rates(
-            options.model_copy(update={"scene": "free", "faces": "drawn", "touch": TOUCH, "neighbours": ()})
-        )
+        free = {"scene": "free", "faces": "drawn", "touch": TOUCH, "neighbours": ()}
+        seconds, _, origin = _stored_rates(options.model_copy(update=free))
         longer, share = STORED_IN_SCENE
         return longer * seconds, share, f"{origin}, in a scene"
     method, name = options.method, options.knobs.name
@@ -180,7 +172,7 @@ def _stored_rates(options: JobOptions) -> tuple[float, float, str]:
 
 
 def machine_of(batches: Iterable[BatchCost]) -> Machine:
-    """Compare the times of these `synthesize` batches with the stored numbers of the same options."""
+    """Compare the seconds of `synthesize` batches with the stored seconds of the same options."""
     comparable = [batch for batch in batches if batch.candidates and _is_stored(batch.request)]
     ratios = [
         batch.seconds / batch.candidates / _stored_rates(batch.request)[0]
@@ -199,7 +191,7 @@ def _is_stored(request: JobOptions) -> bool:
 
 
 def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, float]:
-    """Return the first and last decile of the values, divided by the median; not narrower than `least`."""
+    """Return the first and last decile of the values, divided by the median; at least as wide as `least`."""
     if len(values) < 2 or (middle := median(values)) <= 0:
         return least
     tenths = quantiles(values, n=10, method="inclusive")
@@ -207,12 +199,12 @@ def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, flo
 
 
 def _large_batches(batches: list[BatchCost]) -> list[BatchCost]:
-    """Return batches that are at least half full, or all if none are: loading dominates small ones."""
+    """Return batches that are at least half full, or all if none is: in small batches, loading dominates."""
     return [batch for batch in batches if 2 * batch.candidates >= BATCH_SIZE] or batches
 
 
 def recipe_of(options: JobOptions) -> Hashable:
-    """Return the options that decide the time of a grasp, besides hand, object and device."""
+    """Return the options that decide the cost of a grasp on a given hand, object and device."""
     return (
         options.method,
         tuple(sorted((name, str(value)) for name, value in options.options.items())),
@@ -246,10 +238,10 @@ def picture_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Mac
     """Return seconds and bytes per million pixels, if possible of pictures with the same channels."""
     found = [batch for batch in batches if batch.count]
     found = [batch for batch in found if batch.request.channels == options.channels] or found
-    pixels = sum(batch.count * batch.request.width * batch.request.height for batch in found) / 1e6
-    if not pixels:
+    pixels = [batch.count * batch.request.width * batch.request.height for batch in found]
+    if not (megapixels := sum(pixels) / 1e6):
         return _rate_on_machine(machine, STORED_PICTURE)
-    seconds = sum(batch.seconds for batch in found) / pixels
-    each = [batch.seconds / (batch.count * batch.request.width * batch.request.height) for batch in found]
-    sizes = sum(batch.size_bytes for batch in found) / pixels
+    seconds = sum(batch.seconds for batch in found) / megapixels
+    each = [batch.seconds / number for batch, number in zip(found, pixels, strict=True)]
+    sizes = sum(batch.size_bytes for batch in found) / megapixels
     return StageRate(seconds, sizes, "measured here", len(found), _spread(each, MEASURED_SPREAD))

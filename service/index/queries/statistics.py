@@ -1,4 +1,4 @@
-"""Aggregates over many grasps, computed in the database: means, ranges and distributions of metrics."""
+"""Aggregates over many grasps: means, ranges and distributions of metrics, computed in the database."""
 
 from __future__ import annotations
 
@@ -24,31 +24,25 @@ class MetricSummary:
 
 
 @dataclass(frozen=True)
-class Distribution:
+class Distribution(MetricSummary):
     """Histogram of one metric over the sampled grasps: equal bins from `low` to `high`, inclusive."""
 
-    count: int
-    mean: float
-    low: float
-    high: float
     counts: list[int]
 
 
 @dataclass(frozen=True)
 class GraspKinds:
-    """Counts of grasp types and of approach cells; each omits grasps without a value."""
+    """Numbers of grasps of each `GraspType` and of each approach cell, without grasps that lack the value."""
 
     types: dict[int, int]
-    """Number of grasps of each `GraspType`."""
     cells: dict[int, int]
 
 
 class Statistics(IndexPart):
     def summaries(self, where: GraspFilter, metrics: Sequence[Metric]) -> dict[Metric, MetricSummary]:
         """Return count, mean and range of each metric; metrics without any grasp are omitted."""
-        columns = [
-            function(grasps.c[metric]) for metric in metrics for function in (func.count, func.avg, func.min, func.max)
-        ]
+        functions = (func.count, func.avg, func.min, func.max)
+        columns = [function(grasps.c[metric]) for metric in metrics for function in functions]
         with self.database.read_transaction() as connection:
             row = connection.execute(select(*columns).where(*sql_conditions(where))).one()
         parts = {metric: row[4 * i : 4 * i + 4] for i, metric in enumerate(metrics)}
@@ -59,7 +53,7 @@ class Statistics(IndexPart):
         }
 
     def histogram(self, where: GraspFilter, metric: Metric, low: float, high: float, bins: int) -> list[int]:
-        """Count grasps in equal bins of [low, high]; the last bin includes its upper end."""
+        """Return the number of grasps in each of `bins` equal bins of [low, high], both ends included."""
         counts = [0] * bins
         value = grasps.c[metric]
         width = (high - low) / bins
@@ -77,10 +71,9 @@ class Statistics(IndexPart):
     def compare_distributions(
         self, filters: Sequence[GraspFilter], metrics: Sequence[Metric], *, bins: int = 20, at_most: int = 20_000
     ) -> dict[Metric, list[Distribution | None]]:
-        """Return one distribution per metric and filter in common bins; None without grasps.
+        """Return one distribution per metric and filter, in common bins; None without grasps.
 
-        The grasps are a sample of about `at_most` per filter. Ids of shards are digests, so the ids below a bound are a
-        fair sample; they are adjacent in the index.
+        It covers a fair sample of about `at_most` grasps per filter: shards whose id, a digest, is below a bound.
         """
         samples = [self._values(where, metrics, at_most) for where in filters]
         found: dict[Metric, list[Distribution | None]] = {}
@@ -113,7 +106,7 @@ class Statistics(IndexPart):
 
 
 def _sample(connection: Connection, where: GraspFilter, at_most: int) -> list[ColumnElement[bool]]:
-    """Return the conditions of a filter, restricted to a share of shards with about `at_most` grasps."""
+    """Return the conditions of a filter, restricted to a share of the shards with about `at_most` grasps."""
     group = "job" if where.job is not None else "dataset" if where.dataset is not None else "pair"
     share = min(1.0, at_most / max(1, estimate_row_count(connection, where, group)))
     tests = [c.sql(["job", "dataset"]) for c in conditions(where)]

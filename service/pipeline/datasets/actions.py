@@ -1,6 +1,6 @@
-"""Actions of users on datasets: create, cancel, retry, snapshot; the controller does them in parts.
+"""Actions of users on datasets (create, cancel, retry, snapshot), and their effect on jobs.
 
-The index records which cells have a job, and a job's event names the causing event of the dataset. Another controller
+The index knows which cells have a job, and a job's event names the dataset event that caused it. Another controller
 can therefore continue without applying an event twice.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Final, Literal
 
 from sqlalchemy import Connection
@@ -42,7 +43,7 @@ from graspd.service.store.records import (
 )
 
 log = logging.getLogger(__name__)
-#: Longest time for datasets in one round of the controller [s]: queue and lost workers must not wait long.
+#: Maximum time for datasets in one round of the controller [s], so that other duties do not wait long.
 BUDGET_S: Final = 0.5
 _CELLS_AT_ONCE: Final = 20
 
@@ -50,9 +51,9 @@ _CELLS_AT_ONCE: Final = 20
 def create(
     services: Services, request: DatasetRequest, *, owner: str = "", scope: ProjectScope = EVERYTHING
 ) -> tuple[DatasetView, bool]:
-    """Record a dataset; the controller plans its jobs. An identical request returns the existing dataset.
+    """Record a dataset, whose jobs the controller adds; return the dataset, and whether it is new.
 
-    Return the dataset, and whether it is new. A failed or cancelled dataset is returned unchanged: see `retry`.
+    An identical request returns the existing dataset unchanged.
 
     Raises:
         NotFoundError: unknown hand, object, neighbour, network or set.
@@ -65,12 +66,10 @@ def create(
     shared = with_network(services, shared, hands, scope)
     services.queue.ping()
     key = names.dataset_record_key(request.name)
-    # An existing dataset stays unchanged: a later chart changes none of its fidelities.
     found = None
-    if not services.store.exists(key):
-        found = create_record(
-            request.name, hands, objects, shared, Resolver(services.store).choose, owner, scope.project
-        )
+    if not services.store.exists(key):  # A newer chart must not change the fidelities of an existing dataset.
+        choose = Resolver(services.store).choose
+        found = create_record(request.name, hands, objects, shared, choose, owner, scope.project)
     wanted = [(AssetKind.HAND, one.digest) for one in hands]
     wanted += [(AssetKind.OBJECT, one.digest) for one in objects]
     wanted += [(AssetKind.OBJECT, one.digest) for one in beside]
@@ -79,9 +78,9 @@ def create(
         new = found is not None and put(key, found)
         record = found if found is not None and new else _load_existing(services, request.name)
         if record.project != scope.project:
-            # The message reveals nothing else: names are unique in the whole service.
+            # Names are unique in the whole service. The message reveals nothing else of the other project.
             raise ConflictError(f"the name {record.name!r} is taken; take another name")
-        # Options are compared, not digests: a newer graspd adds options, and older records imply their defaults.
+        # Options are compared instead of digests, because older records lack newer options.
         if not new and (other := _difference(record, hands, objects, shared)):
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
         refuse_pending_deletion(services.store, "dataset", record.name)
@@ -91,10 +90,10 @@ def create(
 
 
 def cancel(services: Services, name: str) -> DatasetView:
-    """Stop a dataset: plan no more jobs and cancel unfinished ones; finished shards stay.
+    """Stop a dataset: no further jobs, and cancel unfinished ones; finished shards stay.
 
-    A job continues if another dataset needs it or another key submitted it. Raises NotFoundError for an unknown
-    dataset, ConflictError for a finished or cancelled one.
+    A job continues if another dataset needs it or another key submitted it. NotFoundError: unknown dataset.
+    ConflictError: it is finished or cancelled.
     """
     with record_transaction(services) as (connection, put):
         dataset = services.index.datasets.get(name)
@@ -105,7 +104,7 @@ def cancel(services: Services, name: str) -> DatasetView:
 
 
 def retry(services: Services, name: str) -> DatasetView:
-    """Restart a dataset's failed and cancelled cells with fresh attempts; ConflictError if it has none."""
+    """Restart a dataset's failed and cancelled cells, with new attempts; ConflictError if there are none."""
     with record_transaction(services) as (connection, put):
         dataset = services.index.datasets.get(name)
         if not dataset.cancelled and not dataset.states[State.FAILED] and not dataset.states[State.CANCELLED]:
@@ -151,16 +150,16 @@ def add_object_set(
     scope: ProjectScope = EVERYTHING,
     may_follow: Callable[[str, str], None] = lambda owner, project: None,
 ) -> ObjectSetView:
-    """Name a set of objects. A change of its objects makes a new version with the same owner.
+    """Name a set of objects; other objects under its name make a new version with the same owner.
 
-    Before a new version, `may_follow` gets the set's owner and project; it may raise.
-    NotFoundError: unknown object. ConflictError: another project has the name. InputError: no objects.
+    `may_follow(owner, project)` may raise before a new version. NotFoundError: unknown object. ConflictError: the name
+    belongs to another project. InputError: no objects.
     """
     assets = [services.index.assets.get(AssetKind.OBJECT, one, scope=scope) for one in objects]
     wanted = tuple(asset.name for asset in assets)
     if not wanted:
         raise InputError(f"the set {name!r} holds no object; name at least one")
-    # Of two concurrent requests for one name, the later one must see the set of the earlier one.
+    # The newest version is read within the transaction, so that concurrent requests for one name see each other.
     with record_transaction(services) as (connection, put):
         after, project = "", scope.project
         if (present := services.index.object_sets.newest_version(name)) is not None:
@@ -175,7 +174,7 @@ def add_object_set(
         refuse_deleted(services, [(AssetKind.OBJECT, one.digest) for one in assets], connection)
         found = object_set_of(name, wanted, after=after, owner=owner, project=project)
         if not put(key := names.object_set_key(name, found.digest), found):
-            # An earlier request ended before it wrote the row.
+            # An earlier request was interrupted before it wrote the row.
             found = read_record(ObjectSet, services.store, key)
             if not scope.can_see(found.project):
                 raise ConflictError(f"the name {name!r} is taken; take another name")
@@ -184,7 +183,7 @@ def add_object_set(
 
 
 def members(services: Services, matrix: Matrix, scope: ProjectScope = EVERYTHING) -> tuple[list[Member], list[Member]]:
-    """Return the present hands and objects of a matrix with sets expanded; errors as in `create`."""
+    """Return names and digests of a matrix's hands and objects, sets included; errors as in `create`."""
     objects = objects_of(services.index, matrix, scope)
     hands = _members(services, AssetKind.HAND, matrix.hands, scope)
     return hands, _members(services, AssetKind.OBJECT, objects, scope)
@@ -210,12 +209,11 @@ def _add_event(
 
 
 def _difference(known: DatasetRecord, hands: list[Member], objects: list[Member], options: JobOptions) -> str:
-    """Describe how another dataset of the same name differs; empty if it is the same."""
+    """Describe how an existing dataset differs from a request for the same name; empty if it does not."""
     words = []
     for what, ours, theirs in (("hands", hands, known.hands), ("objects", objects, known.objects)):
         if tuple(ours) != theirs:
             words.append(f"its {what} are {_member_names(theirs)}")
-    # Dumps cannot be compared: they omit defaults.
     mine, other = ({name: getattr(one, name) for name in JobOptions.model_fields} for one in (options, known.options))
     words += [f"its {name} is {_format_value(other[name])}" for name in mine if mine[name] != other[name]]
     return "; ".join(words)
@@ -234,6 +232,8 @@ def _member_names(members: Iterable[Member]) -> str:
 
 
 class DatasetRounds:
+    """Adds jobs of datasets and applies events of datasets to jobs, a part in each round."""
+
     def __init__(self, services: Services, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._services = services
         self._clock = clock
@@ -241,7 +241,7 @@ class DatasetRounds:
         self._positions: dict[tuple[str, int], int] = {}
 
     def advance(self, budget_s: float = BUDGET_S) -> bool:
-        """Work for at most `budget_s`; return whether work is left."""
+        """Work for about `budget_s` [s]; return whether work is left."""
         deadline = self._clock() + budget_s
         for work in self._services.index.dataset_feed.pending_datasets():
             if not self._apply_event(work, deadline) or not self._plan(work, deadline):
@@ -249,38 +249,32 @@ class DatasetRounds:
         return False
 
     def _plan(self, work: DatasetWork, deadline: float) -> bool:
-        """Make jobs for the cells without a job; return whether all are made."""
-        after = -1
-        while not work.cancelled:
-            cells = self._services.index.dataset_feed.cells_to_plan(work.name, after=after, limit=_CELLS_AT_ONCE)
+        """Add jobs for cells without one, until the deadline; return whether all have a job."""
+        after, feed = -1, self._services.index.dataset_feed
+        while not work.cancelled and (cells := feed.cells_to_plan(work.name, after=after, limit=_CELLS_AT_ONCE)):
             for cell in cells:
                 if self._clock() > deadline:
                     return False
                 job = job_of(cell, work.options, work.revisions, work.owner, work.project)
                 job_actions.enter_job(self._services, self._ranges.with_span(job, among=len(cells)), keeps_assets=True)
                 after = cell.position
-            if not cells:
-                break
         self._services.index.write_dataset.set_progress(work.name, planned=True)
         return True
 
     def _apply_event(self, work: DatasetWork, deadline: float) -> bool:
-        """Cancel or retry the jobs according to the last event; return whether all are done."""
+        """Cancel or retry jobs according to the last event, until the deadline; return whether all are done."""
         if work.applied >= work.events:
             return True
         key = (work.name, work.events)
         states = (State.QUEUED, State.RUNNING) if work.cancelled else (State.FAILED, State.CANCELLED)
-        while True:
-            found = self._services.index.dataset_feed.cells_in_states(
-                work.name, states, after=self._positions.get(key, -1), limit=_CELLS_AT_ONCE, unshared=work.cancelled
-            )
+        feed = self._services.index.dataset_feed
+        cells = partial(feed.cells_in_states, work.name, states, limit=_CELLS_AT_ONCE, unshared=work.cancelled)
+        while found := cells(after=self._positions.get(key, -1)):
             for position, job in found:
                 if self._clock() > deadline:
                     return False
                 self._apply_to_job(job, work)
                 self._positions[key] = position
-            if not found:
-                break
         self._positions.pop(key, None)
         self._services.index.write_dataset.set_progress(work.name, applied=work.events)
         return True
@@ -293,5 +287,5 @@ class DatasetRounds:
         try:
             act(self._services, job, cause=cause)
         except ConflictError as error:
-            # The job ended or was restarted since the query of the index.
+            # The job ended or was restarted after the query of the index.
             log.info("job %s of dataset %s is unchanged: %s", job, work.name, error)

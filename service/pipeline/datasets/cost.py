@@ -1,12 +1,12 @@
-"""Estimate the cost of a dataset before it starts: time for 1, 8 and 64 workers, storage, network.
+"""Cost estimate of a dataset before it starts: time for 1, 8 and 64 workers, storage, network.
 
     candidates of a cell = grasps / yield, at most grasps x budget   (want candidates: grasps)
     seconds of a cell  = candidates x seconds per candidate + batches x scenes x seconds per scene
                          + pictures x seconds per picture
     time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
 
-`service.index.queries.rates` provides rates and intervals. Intervals add, as if all errors were correlated. A worker is
-one process of `graspd worker` on a device like the measured ones.
+`service.index.queries.rates` provides rates and intervals. Intervals add, as if all errors were correlated. Workers are
+assumed to run on devices like the measured ones.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.datasets.spec import MAX_CELLS, Estimate, Matrix, RateUsed, WorkersPlan
 
 WORKERS: Final = (1, 8, 64)
-#: Traffic [bytes] of a task in queue and events, in both directions (docs/explanation/scaling.md).
+#: Traffic [bytes] of a task between worker and Redis (docs/explanation/scaling.md).
 _MESSAGE_BYTES: Final = 19_500
-#: Size [bytes] of an unknown object: a scan of 5000 faces as STL.
+#: Assumed size [bytes] of an unknown asset: an STL file with 5000 faces.
 _ASSET_BYTES: Final = 250_000
 _SHOWN_RATES: Final = 20
 Batches = Callable[[Stage], list[BatchCost]]
@@ -67,10 +67,10 @@ def estimate(
     costs: Batches | None = None,
     scope: ProjectScope = EVERYTHING,
 ) -> Estimate:
-    """Estimate the cost of a matrix. Hands and objects need not exist yet.
+    """Estimate the cost of a matrix, whose hands and objects need not exist yet.
 
-    `resolve` replaces `auto` by a fidelity, or raises InputError if no chart meets the target. `costs` returns the
-    finished batches of a stage; None: read from the index. `scope` limits sets of objects and measurements.
+    `resolve` replaces the fidelity `auto`, or raises InputError. `costs` returns the finished batches of a stage (None:
+    read from the index). `scope` limits sets of objects and measurements.
     """
     objects = objects_of(index, matrix, scope)
     options = matrix.shared
@@ -121,9 +121,8 @@ def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:
 def _estimate(
     options: JobOptions, cells: int, sums: _Sums, later: tuple[StageRate, StageRate], known: tuple[float, list[str]]
 ) -> Estimate:
-    batches = cells * -(-options.grasps // BATCH_SIZE)
-    stages = stages_of(options)
-    scene, picture = later
+    batches, stages = cells * -(-options.grasps // BATCH_SIZE), stages_of(options)
+    (scene, picture), (assets, unknown) = later, known
     pictures = options.scenes * options.views * (2 if options.stereo else 1)
     pixels = batches * pictures * options.width * options.height / 1e6
     seconds = {Stage.SYNTHESIZE: sums.seconds}
@@ -141,7 +140,6 @@ def _estimate(
     low, high = (sum(found) for found in zip(*ends.values(), strict=True))
     read = sum(storage[kind] for kind in list(storage)[:-1])
     network = sum(storage.values()) + read + batches * len(stages) * _MESSAGE_BYTES
-    assets, unknown = known
     return Estimate(
         cells=cells,
         asked=cells * options.grasps,
@@ -171,10 +169,10 @@ def _bounds(seconds: float, rate: StageRate) -> tuple[float, float]:
 def _plan(
     workers: int, totals: tuple[float, float, float], batches: int, cells: int, network: float, assets: float
 ) -> WorkersPlan:
-    """Compute the plan; one worker runs all stages of a batch, so a round takes as long as a batch."""
+    """Return the plan; one worker is assumed to run all stages of a batch."""
     share = max(1 / workers, math.ceil(batches / workers) / batches)
     seconds, low, high = (total * share for total in totals)
-    # Each worker reads hand and object of a cell once, and caches them while it works on the cell.
+    # Each worker reads hand and object of a cell once.
     moved = network + assets * min(workers, max(1, batches // cells))
     return WorkersPlan(
         workers=workers,
@@ -187,7 +185,7 @@ def _plan(
 
 
 def _assets(index: Index, hands: Sequence[str], objects: Sequence[str], scope: ProjectScope) -> tuple[float, list[str]]:
-    """Return the total bytes of hand and object over all cells, and the unknown names."""
+    """Return the total size [bytes] of hands and objects over all cells, and the unknown names."""
     of_hands = index.assets.sizes(AssetKind.HAND, hands, scope=scope)
     of_objects = index.assets.sizes(AssetKind.OBJECT, objects, scope=scope)
     unknown = [name for name in hands if name not in of_hands] + [name for name in objects if name not in of_objects]

@@ -1,4 +1,4 @@
-"""Export of a snapshot as files in a folder, with verified checksums. Existing files are skipped."""
+"""Export of a snapshot as files in a folder, with verified checksums; existing files are skipped."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.records import Snapshot, SnapshotShard
 from graspd.service.store.integrity import check_digest
 
-#: Bytes of a shard, in chunks, from the API or from the store.
+#: Function that yields the bytes of a shard in chunks, from the API or from the store.
 Fetch = Callable[[SnapshotShard], Iterable[bytes]]
-#: Called after each file: files done, files in all, bytes fetched so far.
+#: Called after each file with the numbers of finished files, of all files, and of fetched bytes.
 Progress = Callable[[int, int, int], None]
 _CHUNK: Final = 1 << 20
 
 
 def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Progress | None = None) -> int:
-    """Export the HDF5 files as `HAND/OBJECT/KIND-BATCH.h5`, with `SHA256SUMS` and, last, `snapshot.json`.
+    """Export shards, then `SHA256SUMS` and `snapshot.json`; return the number of fetched shards.
 
-    Return the number of fetched files; DamagedShard if the checksum of a file differs from the snapshot's.
+    Files are `HAND/OBJECT/KIND-BATCH.h5`. DamagedShard: a checksum differs from that in the snapshot.
     """
     _make(folder)
     fetched = size = 0
@@ -58,7 +58,7 @@ def _is_exported(path: Path, shard: SnapshotShard) -> bool:
 
 
 def _fetch(shard: SnapshotShard, path: Path, fetch: Fetch) -> None:
-    """Fetch a shard; the file gets its final name once its checksum matches."""
+    """Fetch a shard to a temporary file, which gets its final name if its checksum matches."""
     draft = path.with_name(f".{path.name}.part")
     digest = hashlib.sha256()
     try:

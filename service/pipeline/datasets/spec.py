@@ -1,7 +1,4 @@
-"""Models of datasets: a user's request, the record derived from it, and its cost estimate.
-
-The request has hands x objects and the options of each cell. No database is imported, so clients can use this module.
-"""
+"""Models of datasets: request, record and cost estimate. For clients, no database is imported."""
 
 from __future__ import annotations
 
@@ -21,11 +18,9 @@ from graspd.service.model.renamed import original_request
 from graspd.service.model.states import Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
-#: Maximum number of cells of a dataset; the record of so many cells has 4 MB.
+#: Maximum number of cells of a dataset, whose record then has 4 MB.
 MAX_CELLS: Final = 100_000
-
-
-#: Unique names, because repeated names would be one cell.
+#: Names without repetitions.
 Names = Annotated[tuple[Name, ...], AfterValidator(lambda given: tuple(dict.fromkeys(given)))]
 
 
@@ -69,15 +64,15 @@ def create_record(
     owner: str = "",
     project: str = "",
 ) -> DatasetRecord:
-    """Return the record of a dataset. Its digest follows from hands, objects, options and fidelities only.
+    """Return the record of a dataset; its digest depends on hands, objects, options and fidelities.
 
-    `choose` replaces `auto` by a fidelity, or raises InputError if none meets the target on one of the cells.
+    `choose` replaces the fidelity `auto` of a cell, or raises InputError if none meets the target.
     """
     cells = [(hand, obj, *choose(request_of(options, hand.name, obj.name))) for hand in hands for obj in objects]
     fidelities = tuple(str(request.fidelity) for _, _, request, _ in cells) if options.fidelity == AUTO else ()
     found = [choice for *_, choice in cells if choice is not None]
     places = {choice: place for place, choice in enumerate(dict.fromkeys(found))}
-    # Digests do not depend on newer options that are unused.
+    # Unused newer options are omitted, so that digests of older datasets stay.
     unused = {name for name in ("options", "target") if not getattr(options, name)}
     content = {
         "hands": [[hand.name, hand.digest] for hand in hands],
@@ -103,7 +98,7 @@ def create_record(
 
 
 class WorkersPlan(View):
-    """Time and network traffic of the dataset with a number of workers."""
+    """Time and network traffic of a dataset with `workers` workers."""
 
     workers: int
     seconds: float = Field(description="expected time until the dataset is done [s]")
@@ -131,15 +126,13 @@ class Estimate(View):
     candidates: int = Field(description="candidates to plan for the requested grasps")
     valid: int = Field(description="expected number of grasps of the kind in `counted`")
     counted: Literal["valid", "feasible"] = Field(
-        "valid", description="kind of grasps that `valid` counts; feasible: without validation"
+        "valid", description="grasps in `valid`; feasible: without validation"
     )
     tasks: int
     seconds: float
     seconds_low: float = Field(description="lower end of the interval of `seconds` [s]")
     seconds_high: float = Field(description="upper end of the interval of `seconds` [s]")
-    machine_factor: float | None = Field(
-        description="factor on all seconds: ratio of this machine's times to the stored times; None: not measured"
-    )
+    machine_factor: float | None = Field(description="seconds on this machine / stored seconds; None: not measured")
     seconds_by_stage: dict[Stage, float]
     seconds_per_valid: float | None
     storage_bytes: int

@@ -1,5 +1,4 @@
-"""Checks of `graspd doctor` for the service. Each check opens what it needs and returns one finding.
+"""Checks of `graspd doctor` for the service; each check returns one finding.
 
-Checks change nothing: test writes have names of their own and are removed; an index is never created, moved aside or
-filled.
+Checks change nothing: test objects have own names and are removed; no check creates, moves or fills an index.
 """

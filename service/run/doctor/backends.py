@@ -38,7 +38,6 @@ from graspd.service.settings import Settings
 from graspd.service.store.store import Store, open_store
 
 _OLDEST: Final = (6, 2)
-
 _SLOW_REDIS_S: Final = 0.02
 _FULL: Final = 0.9
 _TIMEOUT_S: Final = 5.0
@@ -82,9 +81,7 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
         return bad(f"maxmemory-policy is {policy}: when its memory is full, Redis deletes tasks silently", fix)
     used = int(info.get("used_memory", 0))
     if most and used > _FULL * most:
-        return bad(
-            f"{used >> 20} of {most >> 20} MiB are used", "increase maxmemory, or find other users of this Redis"
-        )
+        return bad(f"{used >> 20} of {most >> 20} MiB are used", "increase maxmemory, or find other users of Redis")
     seconds = _time_write(client)
     line = f"Redis {version} at {_masked_url(settings)}, {1000 * seconds:.1f} ms, {used >> 20} MiB"
     if tuple(int(part) for part in version.split(".")[:2]) < _OLDEST:
@@ -94,10 +91,8 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
         fix = "set requirepass or an ACL in its configuration, and the password in GRASPD_REDIS_URL"
         return warning(f"{line}: it requires no password, so any client can start tasks", fix)
     if seconds > _SLOW_REDIS_S:
-        return warning(
-            f"{line}: slow, since a task takes about 109 operations",
-            "move Redis closer to the workers, or check the network",
-        )
+        fix = "move Redis closer to the workers, or check the network"
+        return warning(f"{line}: slow, since a task takes about 109 operations", fix)
     return good(line)
 
 
@@ -123,18 +118,16 @@ def check_persistence(settings: Settings) -> Finding:
             info = dict(client.info())
     except (RedisError, OSError):
         return skipped("Redis does not answer")
-    fix = "make room on the disk of Redis and see its log; then redis-cli bgrewriteaof"
+    fix = "make room on the disk of Redis and see its log"
     if int(info.get("aof_enabled", 0)):
         for what in ("aof_last_write_status", "aof_last_bgrewrite_status"):
             if info.get(what, "ok") != "ok":
-                return bad(f"the log of writes fails ({what}: {info[what]})", fix)
+                return bad(f"the log of writes fails ({what}: {info[what]})", f"{fix}; then redis-cli bgrewriteaof")
         return good("the log of writes is on: a killed Redis restarts with its tasks")
     if info.get("rdb_last_bgsave_status", "ok") != "ok":
-        return bad("snapshots of Redis fail; it may refuse writes", "make room on the disk of Redis and see its log")
-    return warning(
-        "the log of writes is off: after a crash nothing runs until the controller has queued everything again",
-        "redis-cli config set appendonly yes, and `appendonly yes` in its configuration",
-    )
+        return bad("snapshots of Redis fail, and it may refuse writes", fix)
+    fix = "redis-cli config set appendonly yes, and `appendonly yes` in its configuration"
+    return warning("the log of writes is off: after a crash, tasks wait until they are queued again", fix)
 
 
 def _masked_url(settings: Settings) -> str:
@@ -145,24 +138,18 @@ def _masked_url(settings: Settings) -> str:
 
 
 def _fix(error: Exception, settings: Settings) -> str:
-    said = str(error).upper()
-    if "NOAUTH" in said or "WRONGPASS" in said or "AUTHENTICATION" in said:
+    text = str(error).upper()
+    if any(word in text for word in ("NOAUTH", "WRONGPASS", "AUTHENTICATION")):
         return "put the password into GRASPD_REDIS_URL: redis://:PASSWORD@HOST:6379/0"
-    if "MISCONF" in said or "OOM" in said:
+    if "MISCONF" in text or "OOM" in text:
         return "Redis cannot write: free disk space or memory, and see its log"
-    if settings.redis_url is None:
-        return "the service of this data folder crashed: start `graspd up` again"
-    return _START
+    return "the service of this data folder crashed: start `graspd up` again" if settings.redis_url is None else _START
 
 
-_NONE_HERE: Final = (
-    "there is no index here: GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and controller need one"
-)
-_REBUILD: Final = (
-    "graspd admin index rebuild --check lists all; graspd admin index rebuild fixes them while the service runs"
-)
+_NONE_HERE: Final = "GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and controller need an index"
+_REBUILD: Final = "graspd admin index rebuild, also while the service runs; --check lists all differences"
 _CROWDED: Final = 0.8
-#: Above this number of shards only names are compared.
+#: Number of shards above which only names are compared.
 _ALL_SHARDS: Final = 2000
 #: Time for the controller to process events between two comparisons [s].
 _SETTLES_S: Final = 3.0
@@ -192,22 +179,18 @@ def _check_index(settings: Settings, found: IndexCondition) -> Finding:
     line = f"{found.kind} at {url}, revision {found.revision or 'none'}"
     if not found.may_write:
         return bad(f"{line}: it cannot be written", "name the primary, and grant CREATE and USAGE on the schema")
+    fix = "graspd admin index rebuild: fills a new index from the store"
     if found.revision and not found.is_ready and found.revision > found.newest:
-        return bad(
-            f"{line}: a newer graspd made it; this one knows {found.newest}",
-            "install the newer version here, or graspd admin index rebuild: fills a new index from the store",
-        )
+        fix = f"install the newer version here, or {fix}"
+        return bad(f"{line}: a newer graspd made it; this one knows {found.newest}", fix)
     if found.revision and not found.is_ready:
-        return bad(
-            f"{line}: this graspd has {found.newest}", "graspd admin index rebuild: fills a new index from the store"
-        )
+        return bad(f"{line}: this graspd has {found.newest}", fix)
     if not found.is_ready:
         return warning(line, "the next start makes its tables")
     used, most = found.connections
     if most and used > _CROWDED * most:
-        return warning(
-            f"{line}: {used} of {most} connections are used", "raise max_connections, or run fewer api processes"
-        )
+        fix = "raise max_connections, or run fewer api processes"
+        return warning(f"{line}: {used} of {most} connections are used", fix)
     return good(line)
 
 
@@ -230,38 +213,35 @@ def check_index_identity(settings: Settings) -> Finding:
     if folder is not None and not folder.exists():
         return skipped("there is no store yet")
     store = open_store(settings.resolved_store_url)
-    said, redis = None, None
+    index, redis = None, None
     if not _index_problem(settings):
         with closing(Index(settings.resolved_index_url)) as opened:
-            said = opened.notes.service()
+            index = opened.notes.service()
     if is_redis_expected(settings):
         try:
             with closing(open_queue(settings, patience=0)) as queue:
                 redis = queue.service()
         except QueueUnavailable:
-            if said is None:
+            if index is None:
                 return skipped("there is no index here, and Redis does not answer")
-    found = Identity(
-        service_ids(store), said, redis, recorded_service(settings.data_dir.resolve()), settings.store_url is None
-    )
+    recorded = recorded_service(settings.data_dir.resolve())
+    found = Identity(service_ids(store), index, redis, recorded, settings.store_url is None)
     if why := found.refusal(store.url):
         return bad(why, "see the message, and GRASPD_STORE_URL, GRASPD_INDEX_URL, GRASPD_REDIS_URL")
     if not found.chain:
         return skipped("no service has worked on this store yet")
-    return good("store, index and Redis belong to one service" if said else "store and Redis belong to one service")
+    return good("store, index and Redis belong to one service" if index else "store and Redis belong to one service")
 
 
 def compare_index_with_store(settings: Settings, *, full: bool = False, settles_s: float = _SETTLES_S) -> Finding:
-    """Compare rows with the store; a difference in only one of two comparisons is an event in progress."""
+    """Compare the index with the store twice: an event in progress causes only one difference."""
     if why := _index_problem(settings):
         return skipped(why)
     store = open_store(settings.resolved_store_url)
     with closing(Index(settings.resolved_index_url)) as opened:
         made = opened.notes.completeness()
         if made is None:
-            return warning(
-                "the index is new, and lacks records of the store", "start graspd controller: it fills the index"
-            )
+            return warning("the index is new and lacks records of the store", "graspd controller: fills the index")
         with opened.database.read_transaction() as connection:
             count = int(connection.scalar(select(func.count()).select_from(shards)) or 0)
         whole = full or count <= _ALL_SHARDS
@@ -271,7 +251,7 @@ def compare_index_with_store(settings: Settings, *, full: bool = False, settles_
             again = set(compared(opened, store))
             found = [line for line in found if line in again]
     if found:
-        # A missing shard changes rows of tasks and jobs: list the cause first.
+        # A missing shard also changes rows of tasks and jobs, so shards come first.
         found.sort(key=lambda line: not line.startswith("shards "))
         more = f", and {len(found) - 3} more" if len(found) > 3 else ""
         return bad(f"{'; '.join(found[:3])}{more}", _REBUILD)
@@ -287,28 +267,21 @@ def check_store_damage(settings: Settings) -> Finding:
         count, known = opened.damage.summary(limit=1)
         note, made = opened.notes.scan_note(), opened.notes.completeness()
     if count:
-        return bad(
-            f"{count} objects of the store are damaged or missing, such as {known[0].key}: {known[0].what}",
-            "graspd admin store verify --repair",
-        )
+        example = f"{known[0].key}: {known[0].what}"
+        fix = "graspd admin store verify --repair"
+        return bad(f"{count} objects of the store are damaged or missing, such as {example}", fix)
     if made is not None and made.left_out:
         fix = "put copies in their place, then graspd admin index rebuild"
         return bad(f"{made.left_out} damaged records are not in the index, such as {made.names[0]}", fix)
     if not settings.integrity_scan_mb_per_s:
-        return warning(
-            "no damage is known, and the integrity scan is off",
-            "set GRASPD_INTEGRITY_SCAN_MB_PER_S=1, or run graspd admin store verify regularly",
-        )
-    when = (
-        f"the last scan ended at {note.ended}"
-        if note.ended
-        else "no scan has ended yet; graspd admin store verify scans at once"
-    )
-    return good(f"no damage is known; {when}")
+        fix = "set GRASPD_INTEGRITY_SCAN_MB_PER_S=1, or run graspd admin store verify regularly"
+        return warning("no damage is known, and the integrity scan is off", fix)
+    if not note.ended:
+        return good("no damage is known; no scan has ended yet; graspd admin store verify scans at once")
+    return good(f"no damage is known; the last scan ended at {note.ended}")
 
 
 _FOLDER: Final = "health"
-
 _SLOW_STORE_S: Final = 5.0
 #: Number of concurrent writers of one name; only one may succeed.
 _RIVALS: Final = 4
@@ -324,8 +297,7 @@ def check_configured_store(settings: Settings) -> Finding:
     if folder is not None and not folder.exists():
         return good(f"{folder} is made at the first start, below {existing_ancestor(folder)}")
     try:
-        opened = open_store(settings.resolved_store_url, public_endpoint=settings.store_public_endpoint)
-        return check_store(opened)
+        return check_store(open_store(settings.resolved_store_url, public_endpoint=settings.store_public_endpoint))
     except GraspdError as error:
         fix = f"make room below {folder}, and let user and group write there" if folder else _CREDENTIALS
         return bad(str(error), fix)
@@ -343,9 +315,7 @@ def check_store(opened: Store) -> Finding:
     if not wrong and opened.exists(key):
         wrong = "an object that was removed is still there"
     if wrong:
-        fix = (
-            "use a store that guarantees this: a local disk, Amazon, Google, Azure, SeaweedFS, Ceph, or a recent MinIO"
-        )
+        fix = "use another store: a local disk, Amazon, Google, Azure, SeaweedFS, Ceph, or a recent MinIO"
         return bad(f"{opened.url}: {wrong}", fix)
     line = f"{opened.url}: put, get, list, delete and create-only writes work ({1000 * seconds:.0f} ms)"
     if opened.url.startswith("memory:"):
@@ -361,9 +331,7 @@ def _violated_guarantee(opened: Store, key: str) -> str:
     with ThreadPoolExecutor(_RIVALS) as pool:
         won = list(pool.map(lambda content: opened.put(key, content), contents))
     if sum(won) != 1:
-        return (
-            f"of {_RIVALS} concurrent puts of one name, {sum(won)} succeeded instead of 1: results could be overwritten"
-        )
+        return f"{sum(won)} of {_RIVALS} concurrent puts of one name succeeded instead of 1: data could be overwritten"
     kept = contents[won.index(True)]
     try:
         if opened.get(key) != kept:

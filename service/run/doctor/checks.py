@@ -1,4 +1,4 @@
-"""Checks of an installation, with fixes. Each has a timeout, so a hanging part hides no others."""
+"""Checks of an installation, with fixes. Each check has a timeout, so that a hang hides no others."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Check:
 
 
 def run_checks(checks: Sequence[Check]) -> Iterator[Finding]:
-    """Yield findings in the order of the checks, each as soon as it and all earlier ones are complete."""
+    """Run all checks at once; yield findings in the order of the checks, each as early as possible."""
     started = time.monotonic()
     runs = [_Run(check) for check in checks]
     for run in runs:
@@ -52,7 +52,7 @@ def run_checks(checks: Sequence[Check]) -> Iterator[Finding]:
 
 
 class _Run:
-    """One check in a daemon thread, which does not delay the end of the process."""
+    """Check in a daemon thread, which does not delay the end of the process."""
 
     def __init__(self, check: Check) -> None:
         self.check = check

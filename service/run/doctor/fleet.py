@@ -1,7 +1,7 @@
 """Checks of the fleet: controller, capable workers, the API, and clocks.
 
-Leases use each process's own monotonic clock, so work continues with wrong clocks. Wrong clocks affect displayed times,
-sorting by time, expiry of keys, the grace time of shards, and S3, which refuses requests off by fifteen minutes.
+Wrong clocks do not affect leases, which use monotonic clocks. They affect displayed times, sorting by time, expiry of
+keys, the grace time of shards, and S3, which refuses requests with a difference of fifteen minutes.
 """
 
 from __future__ import annotations
@@ -47,9 +47,7 @@ def _query_queue(settings: Settings, look: Callable[[RqQueue], Finding]) -> Find
 
 
 def check_controller(settings: Settings) -> Finding:
-    dead = bad(
-        "no heartbeat from a controller: finished tasks are not indexed, and nothing is queued", "graspd controller"
-    )
+    dead = bad("no heartbeat from a controller: nothing is indexed or queued", "graspd controller")
     return _query_queue(settings, lambda queue: good("a controller is alive") if queue.is_announced(PART) else dead)
 
 
@@ -68,23 +66,19 @@ def _waiting_tasks(queue: RqQueue) -> Counter[Stage]:
 def _check_workers(beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
     if other := [beat for beat in beats if beat.version != PACKAGE_VERSION]:
         some = ", ".join(sorted({f"{beat.version} on {beat.host}" for beat in other})[:3])
-        return bad(
-            f"{len(other)} workers are of another version: {some}", f"install graspd {PACKAGE_VERSION} there as well"
-        )
+        return bad(f"{len(other)} workers are of another version: {some}", f"install graspd {PACKAGE_VERSION} there")
     if ill := [beat for beat in beats if beat.state == "quarantined"]:
         fix = f"on {ill[0].host}: graspd doctor --only gpu,kernels,disk"
         return bad(f"{len(ill)} workers are in quarantine, such as {ill[0].name}: {ill[0].reason}", fix)
     served = {stage for beat in beats for stage in beat.stages}
     if alone := sorted(stage.value for stage in waiting if stage not in served):
-        tasks = sum(number for stage, number in waiting.items() if stage not in served)
-        return bad(
-            f"{tasks} tasks wait, and no worker serves {', '.join(alone)}", f"graspd worker --stages {','.join(alone)}"
-        )
+        tasks, stages = sum(number for stage, number in waiting.items() if stage not in served), ",".join(alone)
+        return bad(f"{tasks} tasks wait, and no worker serves {', '.join(alone)}", f"graspd worker --stages {stages}")
     if not beats:
         return warning("there is no worker, and no task waits", "graspd worker, or graspd up --workers 1")
-    states = Counter(beat.state for beat in beats)
-    told = ", ".join(f"{number} {state}" for state, number in sorted(states.items()))
-    return good(f"{told}, on {len({beat.host for beat in beats})} machines; {sum(waiting.values())} tasks wait")
+    states = sorted(Counter(beat.state for beat in beats).items())
+    text = ", ".join(f"{number} {state}" for state, number in states)
+    return good(f"{text}, on {len({beat.host for beat in beats})} machines; {sum(waiting.values())} tasks wait")
 
 
 def check_port(settings: Settings) -> Finding:
@@ -98,7 +92,7 @@ def check_port(settings: Settings) -> Finding:
         return skipped(f"no API runs at {url}")
     if found is None:
         return bad(
-            f"no API answers at {url}", "start graspd up or graspd api there; check proxy, firewall and GRASPD_API_URL"
+            f"no API answers at {url}", "start graspd up or graspd api; check proxy, firewall and GRASPD_API_URL"
         )
     if not found:
         return bad(f"the server at {url} is not graspd", "stop it; or set GRASPD_PORT, or GRASPD_API_URL to the API")
@@ -109,7 +103,7 @@ def check_port(settings: Settings) -> Finding:
 
 
 def _readyz(url: str) -> dict[str, Any] | None:
-    """Return an API's answer; {} if it is not graspd's, None if there is no answer."""
+    """Return the answer of an API; {} for another server, None if there is no answer."""
     own = [urllib.request.ProxyHandler({})] if "//127.0.0.1" in url else []
     opener = urllib.request.build_opener(*own)
     try:
@@ -118,7 +112,7 @@ def _readyz(url: str) -> dict[str, Any] | None:
     except urllib.error.HTTPError as error:
         body = error.read(65536)
     except (OSError, ValueError) as error:
-        # A server of another protocol closes the connection or sends garbage; a free port refuses it.
+        # A free port refuses the connection; a server of another protocol closes it or sends other data.
         refused = isinstance(getattr(error, "reason", error), ConnectionRefusedError | socket.gaierror | TimeoutError)
         return None if refused else {}
     except Exception:
@@ -139,9 +133,8 @@ def check_clocks(settings: Settings) -> Finding:
     offsets = dict(_clock_offsets(settings))
     if not offsets:
         return skipped("only this machine's clock can be read")
-    line = ", ".join(
-        f"{who} {offset:+.1f} s" for who, offset in sorted(offsets.items(), key=lambda one: -abs(one[1]))[:5]
-    )
+    largest = sorted(offsets.items(), key=lambda one: -abs(one[1]))[:5]
+    line = ", ".join(f"{who} {offset:+.1f} s" for who, offset in largest)
     most = max(abs(offset) for offset in offsets.values())
     if most > _WRONG_S:
         return bad(f"clocks differ from this one: {line}; S3 refuses such requests, and keys expire wrongly", _FIX)
@@ -151,7 +144,7 @@ def check_clocks(settings: Settings) -> Finding:
 
 
 def _clock_offsets(settings: Settings) -> Iterator[tuple[str, float]]:
-    """Yield name and clock offset to this machine [s]; other checks report missing parts."""
+    """Yield names and clock offsets to this machine [s]; other checks report missing parts."""
     if is_redis_expected(settings):
         with suppress(RedisError, OSError), redis_connection(settings) as client:
             before = time.time()
@@ -159,7 +152,7 @@ def _clock_offsets(settings: Settings) -> Iterator[tuple[str, float]]:
             yield "Redis", seconds + micros / 1e6 - (before + time.time()) / 2
         with suppress(GraspdError), closing(open_queue(settings, patience=0)) as queue:
             beats = queue.workers()
-            # Any age up to the next due heartbeat is normal; only the excess is clock offset.
+            # An age up to the next heartbeat is normal; only the excess is a clock offset.
             due = 4 / 3 * settings.lease_s
             ages = {beat.host: time.time() - _seconds(beat.seen) for beat in beats}
             yield from ((host, -age if age < 0 else min(0.0, due - age)) for host, age in ages.items())
@@ -170,7 +163,7 @@ def _clock_offsets(settings: Settings) -> Iterator[tuple[str, float]]:
 
 
 def _store_time(settings: Settings) -> float:
-    """Return the offset of the store's clock [s], 0 if below a second: some stores have whole seconds."""
+    """Return the offset of the store's clock [s]; 0 below one second, the resolution of some stores."""
     store, key = open_store(settings.resolved_store_url), f"health/clock-{secrets.token_hex(8)}"
     before = time.time()
     try:

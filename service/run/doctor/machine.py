@@ -19,13 +19,13 @@ from graspd.service.settings import Settings
 from graspd.service.store.store import local_folder
 
 _GIB: Final = 2**30
-#: Least free space: a worker's scratch files, a shard and the log of Redis must fit together.
+#: Least free space, for the scratch files of a worker, a shard and the log of Redis [bytes].
 _DISK_BAD: Final = 1 * _GIB
 _DISK_LOW: Final = 5 * _GIB
 _FEW_INODES: Final = 10_000
 _MEMORY_LOW: Final = 2 * _GIB
 _FILES_LOW: Final = 1024
-#: Network file systems: locks of SQLite and sockets are unreliable or fail there.
+#: Types of network file systems, on which sockets and locks of SQLite may fail.
 _NETWORK: Final = re.compile(
     r"nfs4?|cifs|smb3|smbfs|lustre|gpfs|beegfs|ceph|glusterfs|9p|afs|wekafs|panfs|orangefs|"
     r"fuse\.(sshfs|s3fs|glusterfs|ceph-fuse)"
@@ -55,7 +55,7 @@ def check_disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, in
 
 
 def _folders(settings: Settings) -> Iterable[tuple[str, Path, str]]:
-    """Yield name and path of each folder, and the variable that moves it."""
+    """Yield name and path of each folder, and the variable that sets its path."""
     yield "the data folder", settings.data_dir.resolve(), "GRASPD_DATA_DIR"
     if (store := local_store(settings)) is not None:
         yield "the store", store, "GRASPD_STORE_URL"
@@ -73,22 +73,19 @@ def check_data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mou
     there = existing_ancestor(folder)
     if not os.access(there, os.W_OK | os.X_OK):
         return bad(f"{there} cannot be written by user {os.getuid()}", f"chown it, or set GRASPD_DATA_DIR ({folder})")
-    kept_here = [
-        what for what, url in (("the index (SQLite)", settings.index_url), ("Redis", settings.redis_url)) if url is None
-    ]
+    parts = {"the index (SQLite)": settings.index_url, "Redis": settings.redis_url}
+    kept_here = [part for part, url in parts.items() if url is None]
     kind = filesystem(there, mounts)
     if _NETWORK.fullmatch(kind) and kept_here:
         return warning(
             f"{folder} is a network folder ({kind}) and would contain {' and '.join(kept_here)}: locks may fail",
-            "set GRASPD_DATA_DIR to a disk of this machine and GRASPD_STORE_URL=file:///SHARED/FOLDER; or name a "
-            "PostgreSQL and a Redis by GRASPD_INDEX_URL and GRASPD_REDIS_URL",
+            "set GRASPD_DATA_DIR to a local disk and GRASPD_STORE_URL=file:///SHARED/FOLDER; or set GRASPD_INDEX_URL "
+            "(PostgreSQL) and GRASPD_REDIS_URL",
         )
     if there != folder:
         return good(f"{folder} is made at the first start")
     if stat.S_IMODE(folder.stat().st_mode) & 0o077:
-        return warning(
-            f"others can read {folder}: it holds requests, results and hashes of keys", f"chmod 700 {folder}"
-        )
+        return warning(f"others can read {folder}, with requests, results and key hashes", f"chmod 700 {folder}")
     return good(f"{folder}, {kind or 'a file system of unknown kind'}, private to its user")
 
 
@@ -97,7 +94,7 @@ def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
         lines = [line.split() for line in mounts.read_text().splitlines()]
     except OSError:
         return ""
-    # The last mount over the longest path is the visible one. Blanks are written as \040.
+    # Of mounts on the longest path, only the last one is visible. The file has \040 for blanks.
     found = [
         (len(at.parts), number, kind)
         for number, (_, where, kind, *_) in enumerate(lines)

@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from sqlalchemy.dialects import sqlite
 from graspd.api.metrics import Metrics, Snapshot
 from graspd.service.index.notes import Damage
 from graspd.service.index.queries import overview
+from graspd.service.model.clock import timestamp
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.series import SERIES, field_name
 from graspd.service.model.states import Priority, Stage, State
@@ -34,7 +34,7 @@ def tasks(count: int) -> list[TaskMessage]:
     [
         overview.job_count_query(State.QUEUED),
         overview.oldest_job_query(State.RUNNING),
-        overview.grasp_count_query(datetime.now(UTC)),
+        overview.grasp_count_query(timestamp()),
     ],
 )
 def test_no_read_of_the_index_for_metrics_scans_a_table(tmp_path: Path, query: Any) -> None:

@@ -112,7 +112,7 @@ def test_a_log_that_redis_cannot_read_gives_way_to_an_empty_one(
     assert serve(second) == 1
     second.join(0.0)
     assert len(list((tmp_path / "redis").glob("aside-*/appendonlydir"))) == 1
-    assert "the log of Redis is moved to" in caplog.text
+    assert "the log of Redis moves to" in caplog.text
 
 
 def test_a_redis_that_ends_for_want_of_room_keeps_its_log(tmp_path: Path) -> None:

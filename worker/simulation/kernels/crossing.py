@@ -22,8 +22,7 @@ class Solids:
 
 @wp.func
 def is_apart(solids: Solids, s: int, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Check whether a plane of the solid, or the triangle's own, separates the triangle from the solid.
-    The result is False if only a plane through an edge of each would separate them."""
+    """Check whether a face plane of the solid, or the triangle's plane, separates triangle and solid."""
     apart = wp.bool(False)
     i = solids.first_plane[s]
     while i < solids.first_plane[s + 1] and not apart:

@@ -1,7 +1,6 @@
-"""Distances for metrics, exact in sign and value, without smoothing.
+"""Distances of points from meshes and convex pieces, exact in sign and value, for metrics.
 
-`worker.simulation.kernels.surface` serves the optimiser (smoothed, cheap). This module serves validation: the distance
-of a point from the mesh itself, and its depth in the hand's convex pieces."""
+The distances of `worker.simulation.kernels.surface`, for the optimiser, are smoothed and cheap."""
 
 import warp as wp
 

@@ -42,8 +42,8 @@ class Hull:
 @wp.func
 def climb(hull: Hull, start: int, x: vec6):
     """Return a facet that x is above, or -1 if x is inside; the hull contains the origin.
-    Planes are compared by n x / d. The plane with the largest value is the corner of the polar polytope at which a
-    linear function is greatest. An ascent from neighbour to neighbour ends there, as in the simplex method."""
+    An ascent of n x / d from neighbour to neighbour ends at the largest value, as in the simplex method on the polar
+    polytope."""
     here = start
     best = wp.dot(hull.normal[here], x) / hull.offset[here]
     at = wp.int32(-1)

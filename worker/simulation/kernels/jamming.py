@@ -1,5 +1,4 @@
-"""Jams of opening fingers, and the retreat of open hands.
-Fingers that would penetrate other links are held back; hands that are still in contact retreat."""
+"""Jams of opening fingers, held back by other links, and the retreat of open hands still in contact."""
 
 import warp as wp
 

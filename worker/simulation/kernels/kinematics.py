@@ -90,9 +90,8 @@ def forward(
 
 @wp.kernel
 def backward(tree_in: Tree, hands_inout: Hands, gradient_out: wp.array2d(dtype=wp.float32)):
-    """Compute the gradient (B, 6 + D) of a loss from its gradients with respect to bodies, the wrenches.
-    Wrenches are (force, torque about the object's origin). Columns: root translation, root rotation about the pivot
-    (world axes), dofs. Launch over B."""
+    """Compute the gradient (B, 6 + D) of a loss from its gradients by bodies, the wrenches. Launch over B.
+    Columns: root translation, root rotation about the pivot (world axes), dofs."""
     b = wp.tid()
     hands = hands_inout
     if hands.active[b] == 0:

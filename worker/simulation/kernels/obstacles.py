@@ -61,13 +61,12 @@ class Obstacles:
 
 
 @wp.func
-def posed(
-    features: Features, i: wp.int32, b: wp.int32, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
-):
+def posed(features: Features, hands: Hands, i: wp.int32, b: wp.int32):
+    """Return feature i of hand b in the frame of the hand's bodies."""
     out = Feature()
     out.body = features.body[i]
-    rotation = body_q[b, out.body]
-    out.centre = body_p[b, out.body] + wp.quat_rotate(rotation, features.centre[i])
+    rotation = hands.body_q[b, out.body]
+    out.centre = hands.body_p[b, out.body] + wp.quat_rotate(rotation, features.centre[i])
     out.axis = wp.quat_rotate(rotation, features.axis[i])
     out.radius = features.radius[i]
     return out
@@ -120,23 +119,14 @@ def required_clearance(features: Features, obstacles: Obstacles, i: wp.int32, k:
 
 
 @wp.func
-def is_near(
-    features: Features,
-    obstacles: Obstacles,
-    piece: wp.int32,
-    scene: wp.int32,
-    b: wp.int32,
-    more: wp.float32,
-    room: wp.float32,
-    body_p: wp.array2d(dtype=wp.vec3),
-    body_q: wp.array2d(dtype=wp.quat),
-):
+def is_near(features: Features, obstacles: Obstacles, hands: Hands, b: int, piece: int, more: float, room: float):
     """Check whether the ball around a piece is closer to a half-space than its clearance plus `more`."""
     if features.first[piece] == features.first[piece + 1]:
         return False
     i = features.first[piece]
     body = features.body[i]
-    middle = body_p[b, body] + wp.quat_rotate(body_q[b, body], features.middle[piece])
+    middle = hands.body_p[b, body] + wp.quat_rotate(hands.body_q[b, body], features.middle[piece])
+    scene = hands.scene[b]
     for k in range(obstacles.first[scene], obstacles.first_solid[scene]):
         beyond = float(-1.0e9)
         for p in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
@@ -162,10 +152,10 @@ def penalty(
     hands = hands_inout
     if hands.active[b] == 0 or hands.scene[b] < 0:
         return
-    if not is_near(features_in, obstacles_in, piece, hands.scene[b], b, 0.0, room_in, hands.body_p, hands.body_q):
+    if not is_near(features_in, obstacles_in, hands, b, piece, 0.0, room_in):
         return
     for i in range(features_in.first[piece], features_in.first[piece + 1]):
-        f = posed(features_in, i, b, hands.body_p, hands.body_q)
+        f = posed(features_in, hands, i, b)
         weight = 2.0 * weight_in[hands.iteration[0]]
         for k in range(obstacles_in.first[hands.scene[b]], obstacles_in.first_solid[hands.scene[b]]):
             nd = obstacle_distance(obstacles_in, k, f)
@@ -192,10 +182,10 @@ def residuals(
     hands = hands_in
     if hands.active[b] == 0 or hands.scene[b] < 0:
         return
-    if not is_near(features_in, obstacles_in, piece, hands.scene[b], b, near_in, 0.0, hands.body_p, hands.body_q):
+    if not is_near(features_in, obstacles_in, hands, b, piece, near_in, 0.0):
         return
     for i in range(features_in.first[piece], features_in.first[piece + 1]):
-        f = posed(features_in, i, b, hands.body_p, hands.body_q)
+        f = posed(features_in, hands, i, b)
         for k in range(obstacles_in.first[hands.scene[b]], obstacles_in.first_solid[hands.scene[b]]):
             nd = obstacle_distance(obstacles_in, k, f)
             margin = required_clearance(features_in, obstacles_in, i, k, 0.0)

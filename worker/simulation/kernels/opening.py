@@ -1,6 +1,4 @@
-"""Opening of the fingers of a grasp: directions, and the first step with enough clearance.
-
-Fingers are checked one by one, all hands in parallel; finished hands and fingers are skipped."""
+"""Opening of the fingers of a grasp, one by one: directions, and the first step with enough clearance."""
 
 import warp as wp
 

@@ -34,8 +34,7 @@ class Pieces:
 
 @wp.func
 def piece_distance(pieces: Pieces, piece: wp.int32, x: wp.vec3):
-    """Return (gradient, signed distance) at x (piece frame).
-    Inside it is exact; outside a hull it is the largest plane distance, a lower bound."""
+    """Return (gradient, signed distance) at x (piece frame); outside a hull a lower bound of the distance."""
     kind = pieces.kind[piece]
     size = pieces.size[piece]
     n = wp.vec3(1.0, 0.0, 0.0)
@@ -147,8 +146,7 @@ def cell_range(low: wp.float32, high: wp.float32, origin: wp.float32, size: wp.f
 
 @wp.func
 def cells_around(samples: Samples, p: wp.vec3, extent: wp.vec3):
-    """Return the cells that a box of these half extents about p meets.
-    The result is first and last along x, y, z; first > last if there are none."""
+    """Return first and last cells along x, y, z that a box about p meets; first > last if there are none."""
     low = samples.low
     size = samples.size
     shape = samples.shape

@@ -165,17 +165,16 @@ def add_chain(
     point: wp.vec3,
     direction: wp.vec3,
     sign: wp.float32,
-    body_p: wp.array2d(dtype=wp.vec3),
-    axis: wp.array2d(dtype=wp.vec3),
+    hands: Hands,
     row: wp.array2d(dtype=wp.float32),
 ):
     """Add the joints' part of a row: motion of a point of `body` along `direction`."""
     k = body
     while k > 0:
-        a = axis[b, k]
+        a = hands.axis[b, k]
         g = wp.dot(a, direction)
         if tree.joint_type[k] == 1:
-            g = wp.dot(wp.cross(a, point - body_p[b, k]), direction)
+            g = wp.dot(wp.cross(a, point - hands.body_p[b, k]), direction)
         column = 6 + tree.dof[k]
         row[own, column] = row[own, column] + sign * tree.multiplier[k] * g
         k = tree.parent[k]
@@ -212,10 +211,10 @@ def normal_equations(
         other = residuals_in.other[b, k]
         point = residuals_in.point[b, k]
         direction = residuals_in.direction[b, k]
-        add_chain(tree_in, b, own, body, point, direction, 1.0, hands_in.body_p, hands_in.axis, row_out)
+        add_chain(tree_in, b, own, body, point, direction, 1.0, hands_in, row_out)
         if other >= 0:
             # Both links move with the root: only the joints between them count.
-            add_chain(tree_in, b, own, other, point, direction, -1.0, hands_in.body_p, hands_in.axis, row_out)
+            add_chain(tree_in, b, own, other, point, direction, -1.0, hands_in, row_out)
         else:
             turn = wp.cross(point - hands_in.pivot[b], direction)
             for i in range(3):

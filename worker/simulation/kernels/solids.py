@@ -146,18 +146,9 @@ def over_face(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
 
 
 @wp.func
-def apart(
-    pieces: Pieces,
-    obstacles: Obstacles,
-    piece: wp.int32,
-    k: wp.int32,
-    b: wp.int32,
-    reach: wp.float32,
-    body_p: wp.array2d(dtype=wp.vec3),
-    body_q: wp.array2d(dtype=wp.quat),
-):
+def apart(pieces: Pieces, obstacles: Obstacles, hands: Hands, b: int, piece: int, k: int, reach: float):
     """Check whether the bounding spheres of a piece and an obstacle are farther than `reach` apart."""
-    offset = piece_centre(pieces, piece, b, body_p, body_q) - obstacles.centre[k]
+    offset = piece_centre(pieces, piece, b, hands.body_p, hands.body_q) - obstacles.centre[k]
     r = obstacles.radius[k] + wp.length(pieces.half[piece]) + wp.max(reach, 0.0)
     return wp.dot(offset, offset) > r * r
 
@@ -167,18 +158,17 @@ def nearest_edge(
     features: Features,
     pieces: Pieces,
     obstacles: Obstacles,
-    piece: wp.int32,
-    k: wp.int32,
-    b: wp.int32,
+    hands: Hands,
+    b: int,
+    piece: int,
+    k: int,
     limit: wp.float32,
-    body_p: wp.array2d(dtype=wp.vec3),
-    body_q: wp.array2d(dtype=wp.quat),
 ):
     """Return the edge of obstacle k nearest to a piece, or the piece's deepest edge in the obstacle."""
     out = NearestObstacle()
     out.distance = limit
-    q = piece_rotation(pieces, piece, b, body_q)
-    p = piece_centre(pieces, piece, b, body_p, body_q)
+    q = piece_rotation(pieces, piece, b, hands.body_q)
+    p = piece_centre(pieces, piece, b, hands.body_p, hands.body_q)
     for e in range(obstacles.first_edge[k], obstacles.first_edge[k + 1]):
         start = obstacles.start[e]
         end = obstacles.end[e]
@@ -191,8 +181,8 @@ def nearest_edge(
             out.direction = -wp.quat_rotate(q, found.gradient)
     body = pieces.body[piece]
     for e in range(features.first_edge[piece], features.first_edge[piece + 1]):
-        start = body_p[b, body] + wp.quat_rotate(body_q[b, body], features.start[e])
-        end = body_p[b, body] + wp.quat_rotate(body_q[b, body], features.end[e])
+        start = hands.body_p[b, body] + wp.quat_rotate(hands.body_q[b, body], features.start[e])
+        end = hands.body_p[b, body] + wp.quat_rotate(hands.body_q[b, body], features.end[e])
         thickness = features.thickness[e]
         # Obstacle edges and link features give the distance of separate bodies, so only penetration counts here.
         deepest = least_on_edge(pieces, -1, obstacles, k, start, end, wp.min(out.distance, 0.0) + thickness)
@@ -223,10 +213,10 @@ def penalty(
     weight = 2.0 * weight_in[hands.iteration[0]]
     for k in range(obstacles_in.first_solid[hands.scene[b]], obstacles_in.first[hands.scene[b] + 1]):
         keep = required_clearance(features_in, obstacles_in, first, k, room_in)
-        if apart(pieces_in, obstacles_in, piece, k, b, keep, hands.body_p, hands.body_q):
+        if apart(pieces_in, obstacles_in, hands, b, piece, k, keep):
             continue
         for i in range(first, features_in.first[piece + 1]):
-            f = posed(features_in, i, b, hands.body_p, hands.body_q)
+            f = posed(features_in, hands, i, b)
             nd = obstacle_distance(obstacles_in, k, f)
             short = nd[3] - keep
             if short < 0.0:
@@ -234,7 +224,7 @@ def penalty(
                 force = (weight * short) * n
                 add_wrench(hands.wrench, b, body, force, wp.cross(lowest_point(f, n), force))
                 wp.atomic_max(depth_inout, b, -short)
-        near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, keep, hands.body_p, hands.body_q)
+        near = nearest_edge(features_in, pieces_in, obstacles_in, hands, b, piece, k, keep)
         short = near.distance - keep
         if short < 0.0:
             force = (weight * short) * near.direction
@@ -263,15 +253,15 @@ def residuals(
         margin = required_clearance(features_in, obstacles_in, first, k, 0.0)
         keep = margin + near_in
         target = margin + target_in
-        if apart(pieces_in, obstacles_in, piece, k, b, keep, hands.body_p, hands.body_q):
+        if apart(pieces_in, obstacles_in, hands, b, piece, k, keep):
             continue
         for i in range(first, features_in.first[piece + 1]):
-            f = posed(features_in, i, b, hands.body_p, hands.body_q)
+            f = posed(features_in, hands, i, b)
             nd = obstacle_distance(obstacles_in, k, f)
             if nd[3] < keep:
                 n = wp.vec3(nd[0], nd[1], nd[2])
                 emit(residuals_out, b, body, -1, lowest_point(f, n), n, nd[3] - target, 1.0)
-        near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, keep, hands.body_p, hands.body_q)
+        near = nearest_edge(features_in, pieces_in, obstacles_in, hands, b, piece, k, keep)
         if near.distance < keep:
             emit(residuals_out, b, body, -1, near.point, near.direction, near.distance - target, 1.0)
 
@@ -281,8 +271,7 @@ def distances(
     features_in: Features,
     pieces_in: Pieces,
     obstacles_in: Obstacles,
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
+    hands_in: Hands,
     reach_in: wp.float32,
     distance_inout: wp.array2d(dtype=wp.float32),
 ):
@@ -292,15 +281,15 @@ def distances(
     body = pieces_in.body[piece]
     least = reach_in
     for k in range(obstacles_in.first_solid[0], obstacles_in.first[1]):
-        if apart(pieces_in, obstacles_in, piece, k, b, least, body_p_in, body_q_in):
+        if apart(pieces_in, obstacles_in, hands_in, b, piece, k, least):
             continue
         for i in range(features_in.first[piece], features_in.first[piece + 1]):
-            f = posed(features_in, i, b, body_p_in, body_q_in)
+            f = posed(features_in, hands_in, i, b)
             nd = obstacle_distance(obstacles_in, k, f)
             if nd[3] < least:
                 n = wp.vec3(nd[0], nd[1], nd[2])
                 if over_face(obstacles_in, k, lowest_point(f, n) - nd[3] * n):
                     least = nd[3]
-        near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, least, body_p_in, body_q_in)
+        near = nearest_edge(features_in, pieces_in, obstacles_in, hands_in, b, piece, k, least)
         least = wp.min(least, near.distance)
     wp.atomic_min(distance_inout, b, body, least)

@@ -211,7 +211,7 @@ def field_distance(surface: Surface, point: wp.vec3):
 @wp.func
 def distance(surface: Surface, point: wp.vec3, reach: wp.float32, exact_below: wp.float32, keep: wp.float32):
     """Return the mesh's distance near the surface, else the grid's; `reach` outside the grid.
-    Grid distances of at least `keep` also become `reach`; `keep` is at least `exact_below`."""
+    Grid distances of at least `keep` (at least `exact_below`) also become `reach`."""
     if surface.field.shape[0] > 0:
         cube = cube_around(surface, point)
         coarse = cube_distance(cube)

@@ -1,7 +1,6 @@
-"""Wrenches on bodies, summed by many threads in integers, so that thread order changes no bit.
+"""Wrenches on bodies, summed as integers, so that results do not depend on thread order.
 
-A wrench is six counts of `UNIT`: force and torque about the object's origin. Float32 sums depend on their order,
-which differs between runs on a GPU."""
+A wrench is six counts of `UNIT`: force and torque about the object's origin."""
 
 import warp as wp
 

@@ -1,8 +1,7 @@
 """Schedule of level standard for many worlds: close, push six ways, check, take the next grasp.
 
-A tick is the simulation between two checks (`protocol.INTERVAL_S`). After each tick every world checks its own object.
-Worlds do not wait for each other; a world takes the next grasp of the queue when its verdict is decided. Quaternions
-are w x y z, stored in `wp.quat` in this order as in MuJoCo Warp."""
+A tick is the simulation between two checks (`protocol.INTERVAL_S`), after which each world checks its own object.
+Worlds do not wait for each other. Quaternions are w x y z in `wp.quat`, as in MuJoCo Warp."""
 
 from typing import Final
 
@@ -41,24 +40,18 @@ DIVERGED = wp.constant(int(Outcome.DIVERGED))
 CLEAR = wp.constant(BAND[1])
 PATIENT = wp.constant(PATIENCE)
 MOST = wp.constant(MOST_TICKS)
-#: Position of the object in worlds without a grasp, out of reach of the hand [m].
-PARKED = wp.constant(10.0)
+PARKED = wp.constant(10.0)  # position of the object in worlds without a grasp, out of reach of the hand [m]
 
 
 @wp.struct
 class GraspCommands:
     """Commands of N grasps."""
 
-    queue: wp.array(dtype=wp.int32)
-    """The grasps to validate, in turn."""
-    start: wp.array2d(dtype=wp.float32)
-    """(N, nq) state in the pregrasp."""
-    position: wp.array2d(dtype=wp.vec3)
-    """(N, 3) root positions in pregrasp, grasp and squeeze [m]."""
-    turn: wp.array2d(dtype=wp.vec4)
-    """(N, 3) root quaternions."""
-    control: wp.array3d(dtype=wp.float32)
-    """(N, 3, nu) commands of the actuators."""
+    queue: wp.array(dtype=wp.int32)  # the grasps to validate, in turn
+    start: wp.array2d(dtype=wp.float32)  # (N, nq) state in the pregrasp
+    position: wp.array2d(dtype=wp.vec3)  # (N, 3) root positions in pregrasp, grasp and squeeze [m]
+    turn: wp.array2d(dtype=wp.vec4)  # (N, 3) root quaternions
+    control: wp.array3d(dtype=wp.float32)  # (N, 3, nu) commands of the actuators
 
 
 @wp.struct
@@ -79,20 +72,14 @@ class Engine:
 class Worlds:
     """State of the schedule in each of W worlds."""
 
-    grasp: wp.array(dtype=wp.int32)
-    """-1 if no grasp is left for the world."""
-    ticks: wp.array(dtype=wp.int32)
-    """Ticks since the hand began to close."""
-    push: wp.array(dtype=wp.int32)
-    """-1 while closing."""
-    looks: wp.array(dtype=wp.int32)
-    """Ticks of the present push."""
-    broken: wp.array(dtype=wp.int32)
-    """Outcome for the limit that the present push exceeded; 0 if it exceeded none."""
+    grasp: wp.array(dtype=wp.int32)  # -1 if no grasp is left for the world
+    ticks: wp.array(dtype=wp.int32)  # ticks since the hand began to close
+    push: wp.array(dtype=wp.int32)  # -1 while closing
+    looks: wp.array(dtype=wp.int32)  # ticks of the present push
+    broken: wp.array(dtype=wp.int32)  # outcome for the limit that the present push exceeded; 0 if it exceeded none
     before: wp.array(dtype=wp.vec3)
     turned_before: wp.array(dtype=wp.float32)
-    qpos: wp.array2d(dtype=wp.float32)
-    """Closed state from which every push starts; the next two arrays belong to it."""
+    qpos: wp.array2d(dtype=wp.float32)  # closed state from which every push starts; the next two arrays belong to it
     qvel: wp.array2d(dtype=wp.float32)
     warmstart: wp.array2d(dtype=wp.float32)
 
@@ -101,10 +88,8 @@ class Worlds:
 class WorldVerdicts:
     """Verdicts on N grasps."""
 
-    outcome: wp.array2d(dtype=wp.int32)
-    """(N, 6)"""
-    margin: wp.array(dtype=wp.float32)
-    """Largest ratio of displacement or rotation to its limit so far."""
+    outcome: wp.array2d(dtype=wp.int32)  # (N, 6)
+    margin: wp.array(dtype=wp.float32)  # largest ratio of displacement or rotation to its limit so far
     ticks: wp.array(dtype=wp.int32)
     overflow: wp.array(dtype=wp.int32)
 
@@ -115,10 +100,8 @@ class TestConstants:
 
     object_qpos: wp.int32
     object_body: wp.int32
-    push: wp.float32
-    """[N]"""
-    centre: wp.vec3
-    """Centre of mass of the object in its frame [m]."""
+    push: wp.float32  # [N]
+    centre: wp.vec3  # centre of mass of the object in its frame [m]
 
 
 @wp.func
@@ -217,10 +200,8 @@ def take_next(
 
 @wp.kernel
 def begin(
-    # Model:
     terms_in: TestConstants,
     grasps_in: GraspCommands,
-    # Data out:
     worlds_out: Worlds,
     engine_out: Engine,
     state_out: wp.array(dtype=wp.int32),
@@ -230,10 +211,8 @@ def begin(
 
 @wp.kernel
 def check_state(
-    # Model:
     terms_in: TestConstants,
     grasps_in: GraspCommands,
-    # Data out:
     worlds_out: Worlds,
     engine_out: Engine,
     found_out: WorldVerdicts,
@@ -305,13 +284,7 @@ def check_state(
 
 
 @wp.kernel
-def place(
-    # Model:
-    first_in: wp.int32,
-    states_in: wp.array2d(dtype=wp.float32),
-    # Data out:
-    engine_out: Engine,
-):
+def place(first_in: wp.int32, states_in: wp.array2d(dtype=wp.float32), engine_out: Engine):
     """Set the states from row `first_in` on, at rest."""
     w = wp.tid()
     row = wp.min(first_in + w, states_in.shape[0] - 1)
@@ -323,15 +296,12 @@ def place(
 
 @wp.kernel
 def depths(
-    # Model:
     first_in: wp.int32,
     of_hand_in: wp.array(dtype=wp.int32),
-    # Data in:
     contacts_in: wp.array(dtype=wp.int32),
     world_in: wp.array(dtype=wp.int32),
     geom_in: wp.array(dtype=wp.vec2i),
     distance_in: wp.array(dtype=wp.float32),
-    # Data out:
     depth_out: wp.array2d(dtype=wp.float32),
 ):
     """Compute the deepest penetration [m] of hand and object, and within the hand, from row `first_in` on."""

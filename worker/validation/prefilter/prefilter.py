@@ -1,12 +1,10 @@
 """The GPU prefilter in MuJoCo Warp: it decides clear verdicts.
 
-MuJoCo on the CPU decides all other verdicts, and rechecks a sample of the clear ones. At level `standard` the prefilter
-only rejects: clear failures are final, all other grasps are validated on the CPU. At level `fast` clear verdicts of
-both kinds are final. The prefilter is not used at level `dexgraspbench` or for lifts.
+MuJoCo on the CPU decides all other verdicts, and rechecks a sample of the clear ones. At level `standard` only clear
+failures are final, at level `fast` clear verdicts of both kinds. Other levels and lifts do not use the prefilter.
 
-The model is the validator's own, compiled once; data that differ between grasps (postures, commands, pushes) are
-arrays. A pool of worlds takes grasps from a queue on the device. All worlds are busy until the queue is empty, and one
-graph serves any number of grasps."""
+The validator's model is compiled once; postures, commands and pushes are arrays. Worlds take grasps from a queue on the
+device until it is empty, and one graph serves any number of grasps."""
 
 from __future__ import annotations
 
@@ -39,14 +37,11 @@ from graspd.worker.validation.protocol import INTERVAL_S, Outcome, Rollout, Vali
 
 log = logging.getLogger(__name__)
 
-#: One clear verdict in this many is also validated on the CPU.
-RECHECK_ONE_IN: Final = 50
-#: Revision of the prefilter's code; increase it if code (not a constant) changes verdicts.
-REVISION: Final = 1
+RECHECK_ONE_IN: Final = 50  # one clear verdict in this many is also validated on the CPU
+REVISION: Final = 1  # revision of the prefilter's code; increase it if code (not a constant) changes verdicts
 #: Pool sizes, for few grasps and for many; with arbitrary sizes nearly every launch would build a new pool.
 WORLDS: Final = {"cuda": (256, 1024), "cpu": (8, 32)}
-#: Number of cached pools (model, arrays, graph): those that were used last.
-_KEPT_POOLS: Final = 4
+_KEPT_POOLS: Final = 4  # number of cached pools (model, arrays, graph): those that were used last
 #: The prefilter is trusted while the CPU contradicts at most this share of the rechecked verdicts, or only one verdict.
 _MOST_CONTRADICTED: Final = 0.05
 
@@ -55,16 +50,12 @@ _MOST_CONTRADICTED: Final = 0.05
 class PrefilterOutcomes:
     """Outcomes of N grasps in the worlds."""
 
-    outcome: NDArray[np.uint8]
-    """(N, 6) `Outcome` of each push; an undecided grasp has pushes without a simulation."""
-    margin: Floats
-    """(N,) largest ratio of displacement or rotation to its limit."""
+    outcome: NDArray[np.uint8]  # (N, 6) `Outcome` of each push; an undecided grasp has pushes without a simulation
+    margin: Floats  # (N,) largest ratio of displacement or rotation to its limit
     penetration_m: Floats
     self_penetration_m: Floats
-    overflow: NDArray[np.bool_]
-    """(N,) whether contacts or constraints were dropped for lack of memory."""
-    ticks: NDArray[np.int32]
-    """(N,) simulated ticks, of `protocol.INTERVAL_S` each."""
+    overflow: NDArray[np.bool_]  # (N,) whether contacts or constraints were dropped for lack of memory
+    ticks: NDArray[np.int32]  # (N,) simulated ticks, of `protocol.INTERVAL_S` each
 
     @property
     def held(self) -> NDArray[np.bool_]:
@@ -100,10 +91,8 @@ class WorldPool:
         self._engine = mujoco_warp()
         self._steps = round(protocol.INTERVAL_S / scene.physics.timestep)
         self._doublings, self._capacity = 0, 0
-        self.launches = 0
-        """Ticks of the last `validate`."""
-        voiding = (getattr(self._engine.OverflowType, name) for name in _VOIDING)
-        self._voiding = int(sum(int(bit) for bit in voiding))
+        self.launches = 0  # ticks of the last `validate`
+        self._voiding = sum(int(getattr(self._engine.OverflowType, name)) for name in _VOIDING)
         with wp.ScopedDevice(device):
             self._model = self._engine.put_model(scene.model)
             self._model.opt.warn_overflow = 0
@@ -152,8 +141,8 @@ class WorldPool:
         at_start, short_too = self._depths(starts)
         inside = at_start.max(axis=1) > protocol.MAX_PENETRATION_M
         queue, found = np.flatnonzero(~inside), self._found
-        for name in ("outcome", "margin", "ticks", "overflow"):
-            getattr(found, name).zero_()
+        for array in (found.outcome, found.margin, found.ticks, found.overflow):
+            array.zero_()
         self._upload(grasps, starts, queue)
         self._simulate(len(queue), run)
         outcome = found.outcome.numpy()[:n].astype(np.uint8)
@@ -258,10 +247,8 @@ _pools: OrderedDict[tuple[str, str, int], WorldPool] = OrderedDict()
 class PrefilterVerdicts:
     """Verdicts of the prefilter on N grasps."""
 
-    stands: dict[int, Rollout]
-    """Final verdicts, by row. The CPU validates all other rows."""
-    rechecked: dict[int, bool]
-    """Clear verdicts that the CPU rechecks, by row; True if the prefilter held the grasp."""
+    stands: dict[int, Rollout]  # final verdicts, by row; the CPU validates all other rows
+    rechecked: dict[int, bool]  # clear verdicts that the CPU rechecks, by row; True if the prefilter held the grasp
 
     def count_contradicted(self, rollouts: dict[int, Rollout]) -> int:
         return sum(rollouts[row].success != held for row, held in self.rechecked.items())
@@ -273,12 +260,10 @@ class PrefilterVerdicts:
 
 def prefilter_key_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]:
     """Return the prefilter's terms for `verdict_key`; empty if it is not used for verdicts of this level.
-    The prefilter is not used for grippers: their flat pads touch over an area, where the engines distribute contacts
-    differently. It is not used for hands with tendons: the engines differ on a tenth of Shadow's grasps
-    (docs/explanation/quality.md). Raises InputError: the prefilter is required but not installed."""
-    if run.prefilter == "off" or level not in ("standard", "fast"):
-        return []
-    if jaws_of(hand) is not None or hand.tendons:
+    Grippers do without it, since the engines distribute contacts of flat pads differently, and hands with tendons,
+    since the engines differ on a tenth of Shadow's grasps (docs/explanation/quality.md). Raises InputError: the
+    prefilter is required but not installed."""
+    if run.prefilter == "off" or level not in ("standard", "fast") or jaws_of(hand) is not None or hand.tendons:
         return []
     if run.prefilter == "auto" and not (run.device.startswith("cuda") and has_mujoco_warp()):
         return []
@@ -345,8 +330,7 @@ def _rollout(found: PrefilterOutcomes, row: int, scene: Scene) -> Rollout:
 #: Initial capacity of contacts and constraint rows per world: twice the observed need of grasps of three hands.
 CONTACTS: Final = 96
 ROWS: Final = 256
-#: Largest number of times that the capacity is doubled when it overflows.
-DOUBLINGS: Final = 3
+DOUBLINGS: Final = 3  # largest number of times that the capacity is doubled when it overflows
 #: Overflows that drop contacts or constraints. Other overflows are iteration limits, which MuJoCo also has.
 _VOIDING: Final = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")
 
