@@ -88,8 +88,7 @@ class _Evaluation:
     """(N,) cosine of the surface normals within the height with the line between the ends; the lower value of both
     sides."""
     square: Floats
-    over: Floats
-    """(N,) height of the rest of the hand above the plane [m]."""
+    over: Floats  # (N,) height of the rest of the hand above the plane [m]
 
     def cost(self, wanted: Floats) -> Floats:
         """Return the cost (N,) of postures as pinches of the widths `wanted` (N,)."""
@@ -107,14 +106,10 @@ class _PinchSearch:
 
     hand: HandModel
     height: float
-    tips: Floats
-    """(F, V, 3) body frame [m]."""
-    normals: Floats
-    """(F, V, 3)"""
-    others: Floats
-    """(W, 3) body frame [m]."""
-    body: NDArray[np.intp]
-    """(W,) bodies of the other points."""
+    tips: Floats  # (F, V, 3) body frame [m]
+    normals: Floats  # (F, V, 3)
+    others: Floats  # (W, 3) body frame [m]
+    body: NDArray[np.intp]  # (W,) bodies of the other points
 
     @classmethod
     def of(cls, hand: HandModel, height: float) -> _PinchSearch:

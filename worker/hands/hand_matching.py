@@ -43,12 +43,9 @@ class HandMatch:
 
     ours: HandModel
     theirs: HandModel
-    joints: NDArray[np.intp]
-    """(J',) index of the matching joint of `ours` for each joint of `theirs`."""
-    base: Floats
-    """(7,) pose of the root of `theirs` in the root frame of `ours`."""
-    fingertips_m: float
-    """Largest distance of corresponding fingertips over random postures [m]."""
+    joints: NDArray[np.intp]  # (J',) index of the matching joint of `ours` for each joint of `theirs`
+    base: Floats  # (7,) pose of the root of `theirs` in the root frame of `ours`
+    fingertips_m: float  # largest distance of corresponding fingertips over random postures [m]
 
     @cached_property
     def bodies(self) -> NDArray[np.intp]:

@@ -53,24 +53,16 @@ _IN_SPACE: Final = 0.2
 class Jaws:
     """Closing motion of a gripper: K postures from open to contact of the pads, or to the limits."""
 
-    q: Floats
-    """(K, D) dof values."""
-    width: Floats
-    """(K,) clear width between the pads [m]."""
-    middle: Floats
-    """(K, 3) point between the pads, root frame [m]."""
-    axis: Floats
-    """(K, 3) unit vector from the first pad to the second, root frame."""
-    speed: Floats
-    """(K, D, 2) motion of each pad towards the other per dof [m/rad or 1]."""
+    q: Floats  # (K, D) dof values
+    width: Floats  # (K,) clear width between the pads [m]
+    middle: Floats  # (K, 3) point between the pads, root frame [m]
+    axis: Floats  # (K, 3) unit vector from the first pad to the second, root frame
+    speed: Floats  # (K, D, 2) motion of each pad towards the other per dof [m/rad or 1]
     bodies: tuple[tuple[int, ...], tuple[int, ...]]
     """Bodies that carry the first and the second pad; 0 is the root, a jaw that does not move."""
-    points: SurfacePoints
-    """Points on both pads."""
-    first: NDArray[np.bool_]
-    """(P,) mask of the points on the first pad."""
-    length: float
-    """Extent of the pads along the approach [m]; 0 if no approach is known."""
+    points: SurfacePoints  # points on both pads
+    first: NDArray[np.bool_]  # (P,) mask of the points on the first pad
+    length: float  # extent of the pads along the approach [m]; 0 if no approach is known
 
     @cached_property
     def opening(self) -> float:
@@ -311,12 +303,9 @@ class Pad:
     """Part of a body's surface that presses on objects, in the body's frame."""
 
     body: int
-    centre: Floats
-    """(3,) [m]"""
-    normal: Floats
-    """(3,) unit: pressing direction."""
-    points: Floats
-    """(P, 3) surface points [m]; empty if the body has no shape."""
+    centre: Floats  # (3,) [m]
+    normal: Floats  # (3,) unit: pressing direction
+    points: Floats  # (P, 3) surface points [m]; empty if the body has no shape
 
 
 def pads_of(hand: HandModel) -> tuple[Pad, ...]:

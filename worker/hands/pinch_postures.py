@@ -57,14 +57,10 @@ _CLOSING_M: Final = 0.003
 class Oppositions:
     """K postures in which pads of a hand face one another, sorted by width; root frame."""
 
-    q: Floats
-    """(K, D)"""
-    axis: Floats
-    """(K, 3) unit vector from the opposing finger's pad to the other pads."""
-    middle: Floats
-    """(K, 3) midpoint [m]."""
-    width: Floats
-    """(K,) gap, ascending [m]."""
+    q: Floats  # (K, D)
+    axis: Floats  # (K, 3) unit vector from the opposing finger's pad to the other pads
+    middle: Floats  # (K, 3) midpoint [m]
+    width: Floats  # (K,) gap, ascending [m]
 
     def __len__(self) -> int:
         return len(self.q)
@@ -136,12 +132,9 @@ class _PadGaps:
     axis: Floats
     middle: Floats
     width: Floats
-    facing: Floats
-    """(N,) cosine of the pads' normals with the line between the pads; the lower value of both sides."""
-    square: Floats
-    """(N,) absolute cosine of the palm's approach with the line between the pads."""
-    ahead: Floats
-    """(N,) distance of the line's middle in front of the palm [m]."""
+    facing: Floats  # (N,) cosine of the pads' normals with the line between the pads; the lower value of both sides
+    square: Floats  # (N,) absolute cosine of the palm's approach with the line between the pads
+    ahead: Floats  # (N,) distance of the line's middle in front of the palm [m]
 
     @classmethod
     def of(cls, hand: HandModel, pads: list[Pad], one: int, q: Floats) -> _PadGaps:

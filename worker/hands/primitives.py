@@ -169,22 +169,14 @@ class HandFeatures:
     """F balls and rims, and E edges, of P convex pieces; fixed to the bodies of a hand.
     A plane meets balls and rims first; a convex solid that penetrates a piece meets one of them or an edge."""
 
-    body: NDArray[np.int32]
-    """(F,)"""
-    centre: Floats
-    """(F, 3) body frame."""
-    axis: Floats
-    """(F, 3) axis of a rim, body frame; zero for a ball."""
-    radius: Floats
-    """(F,) [m]"""
-    first: NDArray[np.int32]
-    """(P + 1,) the first feature of each piece."""
-    edges: Floats
-    """(E, 2, 3) ends, body frame."""
-    thickness: Floats
-    """(E,) radius about an edge: 0 except for capsules and spheres."""
-    first_edge: NDArray[np.int32]
-    """(P + 1,) the first edge of each piece."""
+    body: NDArray[np.int32]  # (F,)
+    centre: Floats  # (F, 3) body frame
+    axis: Floats  # (F, 3) axis of a rim, body frame; zero for a ball
+    radius: Floats  # (F,) [m]
+    first: NDArray[np.int32]  # (P + 1,) the first feature of each piece
+    edges: Floats  # (E, 2, 3) ends, body frame
+    thickness: Floats  # (E,) radius about an edge: 0 except for capsules and spheres
+    first_edge: NDArray[np.int32]  # (P + 1,) the first edge of each piece
 
     def __len__(self) -> int:
         return len(self.body)

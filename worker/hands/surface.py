@@ -44,8 +44,7 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
 @dataclass(frozen=True)
 class _Shapes:
     pieces: tuple[ConvexPiece, ...]
-    rest: Floats
-    """(L, 7) poses of the hand's bodies."""
+    rest: Floats  # (L, 7) poses of the hand's bodies
 
     @cached_property
     def content(self) -> str:

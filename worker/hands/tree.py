@@ -40,21 +40,15 @@ class Tree:
     """Bodies with parents first; body 0 is the root."""
 
     bodies: tuple[Body, ...]
-    links: dict[str, tuple[int, Floats]]
-    """Body of each retained link, and its pose in the body's frame."""
-    drives: dict[str, Mimic]
-    """Degree of freedom that each moving joint follows, by name of the joint."""
-    joint_names: tuple[str, ...]
-    """Moving joints in the robot's order."""
-    dof_names: tuple[str, ...]
-    """Independent joints in the robot's order."""
+    links: dict[str, tuple[int, Floats]]  # body of each retained link, and its pose in the body's frame
+    drives: dict[str, Mimic]  # degree of freedom that each moving joint follows, by name of the joint
+    joint_names: tuple[str, ...]  # moving joints in the robot's order
+    dof_names: tuple[str, ...]  # independent joints in the robot's order
     lower: Floats
     upper: Floats
     velocity: Floats
-    still: tuple[str, ...]
-    """Joints fixed because their limits leave one value."""
-    known: frozenset[str]
-    """Names of all joints and links of the robot, dropped and frozen ones too."""
+    still: tuple[str, ...]  # joints fixed because their limits leave one value
+    known: frozenset[str]  # names of all joints and links of the robot, dropped and frozen ones too
 
 
 def build_tree(robot: Robot, options: HandOptions) -> Tree:

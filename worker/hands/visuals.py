@@ -29,12 +29,9 @@ class VisualMesh:
     """Triangle mesh of one colour on a body."""
 
     body: int
-    vertices: Floats
-    """(V, 3) in the body frame [m]."""
-    faces: Ints
-    """(F, 3)"""
-    colour: tuple[float, float, float] | None
-    """sRGB, 0 .. 1; None if not stated."""
+    vertices: Floats  # (V, 3) in the body frame [m]
+    faces: Ints  # (F, 3)
+    colour: tuple[float, float, float] | None  # sRGB, 0 .. 1; None if not stated.
 
 
 @dataclass(frozen=True)
@@ -53,8 +50,7 @@ class Visuals:
 
     placed: Sequence[PlacedShape] = ()
     files: Mapping[str, bytes] = field(default_factory=dict, repr=False)
-    base: str = ""
-    """Folder of the robot's description inside `files`."""
+    base: str = ""  # folder of the robot's description inside `files`
 
     @cached_property
     def content(self) -> str:

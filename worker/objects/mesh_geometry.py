@@ -166,12 +166,9 @@ LEAST_DIGITS: Final = 5
 class CentredMesh:
     """Points of a mesh relative to the middle of their bounding box, in the units of its file."""
 
-    points: Floats
-    """(V, 3)"""
-    centre: Floats
-    """(3,) the middle in the file's frame."""
-    resolution: float
-    """Spacing of the file's numbers at the mesh's position."""
+    points: Floats  # (V, 3)
+    centre: Floats  # (3,) the middle in the file's frame
+    resolution: float  # spacing of the file's numbers at the mesh's position
 
 
 def centre_points(points: Floats) -> CentredMesh:

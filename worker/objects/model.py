@@ -23,34 +23,22 @@ Ints = NDArray[np.int32]
 class ObjectModel:
     name: str
     digest: str
-    vertices: Floats
-    """(V, 3) [m]"""
-    faces: Ints
-    """(F, 3) counter-clockwise from outside."""
+    vertices: Floats  # (V, 3) [m]
+    faces: Ints  # (F, 3) counter-clockwise from outside
     corner_normals: Floats
     """(F, 3, 3) unit normals per face corner, averaged over faces that meet below the crease angle."""
-    volume: float
-    """[m^3]"""
-    centre_of_mass: Floats
-    """(3,) at uniform density [m]."""
-    inertia: Floats
-    """(3, 3) about the centre of mass, per unit of mass [m^2]."""
-    radius: float
-    """Largest distance of a vertex from the centre of mass [m]."""
-    hull_vertices: Floats
-    """(H, 3) corners of the convex hull [m]."""
-    hull_faces: Ints
-    """(G, 3) outward."""
+    volume: float  # [m^3]
+    centre_of_mass: Floats  # (3,) at uniform density [m]
+    inertia: Floats  # (3, 3) about the centre of mass, per unit of mass [m^2]
+    radius: float  # largest distance of a vertex from the centre of mass [m]
+    hull_vertices: Floats  # (H, 3) corners of the convex hull [m]
+    hull_faces: Ints  # (G, 3) outward
     watertight: bool = True
-    deviation_m: float = 0.0
-    """Largest distance between the prepared surface and the uploaded one [m]."""
+    deviation_m: float = 0.0  # largest distance between the prepared surface and the uploaded one [m]
     repairs: tuple[str, ...] = ()
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Middle of the mesh [m]; zero for a model that is `centred`."""
-    mass: float = field(default=MASS_KG, metadata=TOLD_IF_SET)
-    """[kg]"""
-    friction: float = field(default=FRICTION, metadata=TOLD_IF_SET)
-    """Coulomb coefficient of its contacts in simulation."""
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # middle of the mesh [m]; zero for a model that is `centred`
+    mass: float = field(default=MASS_KG, metadata=TOLD_IF_SET)  # [kg]
+    friction: float = field(default=FRICTION, metadata=TOLD_IF_SET)  # Coulomb coefficient of its contacts in simulation
     about_centre: Floats | None = field(default=None, repr=False)
     """(V + H + 1, 3) vertices, hull and centre of mass relative to the middle [m]; None if centred."""
 

@@ -49,18 +49,14 @@ _SAMPLES: Final = 4000
 class RepairedMesh:
     """Mesh in metres, with a list of changes and a list of accepted anomalies."""
 
-    vertices: Floats
-    """(V, 3) relative to the middle of the mesh."""
+    vertices: Floats  # (V, 3) relative to the middle of the mesh
     faces: Indices
     watertight: bool = True
     repairs: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    self_intersections: int | None = None
-    """Pairs of faces that still intersect; None if not checked."""
-    moved_m: float = 0.0
-    """Largest distance of the repaired surface from the original [m]."""
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """The middle in the file's frame [m]."""
+    self_intersections: int | None = None  # pairs of faces that still intersect; None if not checked
+    moved_m: float = 0.0  # largest distance of the repaired surface from the original [m]
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the middle in the file's frame [m]
 
     def with_faces(self, vertices: Floats, faces: Indices, repair: str) -> RepairedMesh:
         return replace(self, vertices=vertices, faces=faces, repairs=(*self.repairs, repair))

@@ -56,8 +56,7 @@ MOST_NEIGHBOURS: Final = 8
 @dataclass(frozen=True)
 class Neighbours:
     objects: Sequence[ObjectModel]
-    poses: Floats
-    """(S, M, 7) in the table frame."""
+    poses: Floats  # (S, M, 7) in the table frame
 
     @property
     def centred(self) -> Neighbours:

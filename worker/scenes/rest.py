@@ -33,20 +33,13 @@ ROLLS = np.radians(20.0)
 class RestingFaces:
     """C flat faces of the convex hull, in the object frame."""
 
-    normal: Floats
-    """(C, 3) unit normals, outward."""
-    offset: Floats
-    """(C,) normal . x of the face's plane [m]."""
-    successor: Ints
-    """(C,) face onto which the object tips when placed on this face; the face itself where it is stable."""
-    height: Floats
-    """(C,) height of the centre of mass above each face [m]."""
-    sides: Ints
-    """(E, 2) pairs of adjacent faces; a row is one edge of its first face."""
-    margin: Floats
-    """(E,) distance from each edge to the projected centre of mass, positive inside the face [m]."""
-    width: Floats
-    """(E,) width of the face across each edge [m]."""
+    normal: Floats  # (C, 3) unit normals, outward
+    offset: Floats  # (C,) normal . x of the face's plane [m].
+    successor: Ints  # (C,) face onto which the object tips when placed on this face; the face itself where it is stable
+    height: Floats  # (C,) height of the centre of mass above each face [m]
+    sides: Ints  # (E, 2) pairs of adjacent faces; a row is one edge of its first face
+    margin: Floats  # (E,) distance from each edge to the projected centre of mass, positive inside the face [m]
+    width: Floats  # (E,) width of the face across each edge [m]
 
     @property
     def stable_faces(self) -> Ints:

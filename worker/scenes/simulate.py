@@ -49,8 +49,7 @@ _CONTACT: Final[dict[str, Any]] = {"friction": [0.8, 0.005, 0.002], "condim": 6,
 
 @dataclass(frozen=True)
 class RestPose:
-    pose: Floats
-    """(7,) object frame in the table frame, laid flat on `face`."""
+    pose: Floats  # (7,) object frame in the table frame, laid flat on `face`
     face: int
     seconds: float
 

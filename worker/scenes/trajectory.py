@@ -41,24 +41,15 @@ _FREE_POINTS: Final = (2000, 3000)
 class Trajectory:
     """Trajectories of N grasps to contact and lift, in the object frame."""
 
-    approach: Floats
-    """(N, W, 7) hand poses from the standoff to the pregrasp, with the joint positions `open`."""
-    open: Floats
-    """(N, J) joint positions of the open hand on its approach."""
-    lift: Posture
-    """N squeeze postures moved up against gravity."""
-    contact: Floats
-    """(N,) least clearance from obstacles at the grasp [m]."""
-    closing: Floats
-    """(N,) least clearance from the pregrasp to the grasp [m]."""
-    coming: Floats
-    """(N,) least clearance from obstacles on the approach [m]; `touching` is the contact with the object."""
-    lifting: Floats
-    """(N,) least clearance on the lift [m]."""
-    touching: NDArray[np.bool_]
-    """(N,) whether the open hand touches the object on its approach."""
-    wrist: Floats
-    """(N, K) angles of the wrist above the hand's root; K is 0 without a wrist."""
+    approach: Floats  # (N, W, 7) hand poses from the standoff to the pregrasp, with the joint positions `open`
+    open: Floats  # (N, J) joint positions of the open hand on its approach
+    lift: Posture  # n squeeze postures moved up against gravity
+    contact: Floats  # (N,) least clearance from obstacles at the grasp [m]
+    closing: Floats  # (N,) least clearance from the pregrasp to the grasp [m]
+    coming: Floats  # (N,) least clearance from obstacles on the approach [m]; `touching` is the contact with the object
+    lifting: Floats  # (N,) least clearance on the lift [m]
+    touching: NDArray[np.bool_]  # (N,) whether the open hand touches the object on its approach
+    wrist: Floats  # (N, K) angles of the wrist above the hand's root; K is 0 without a wrist
     mounting: Floats
     """(N,) least clearance of the hand's mounting at the grasp, while the hand closes, and on the lift [m].
     On the approach the mounting counts as part of the hand."""
