@@ -50,24 +50,15 @@ class ObjectModel:
     @property
     def centred(self) -> ObjectModel:
         """The object in a frame at its middle: the same bits for any origin of the file."""
-        if self.about_centre is None:
-            return self
-        count = len(self.vertices)
-        vertices, hull, mass = self.about_centre[:count], self.about_centre[count:-1], self.about_centre[-1]
-        return self._in_frame(vertices, hull, mass, (0.0, 0.0, 0.0), None)
+        return self if self.about_centre is None else self._with_points(self.about_centre, (0.0, 0.0, 0.0), None)
 
     def place_at(self, centre: tuple[float, float, float]) -> ObjectModel:
         """Return a centred object in a frame in which the object's middle is at `centre` [m]."""
-        if not any(centre):
-            return self
-        held = np.concatenate([self.vertices, self.hull_vertices, self.centre_of_mass[None]])
-        return self._in_frame(
-            self.vertices + centre, self.hull_vertices + centre, self.centre_of_mass + centre, centre, held
-        )
+        points = np.concatenate([self.vertices, self.hull_vertices, self.centre_of_mass[None]])
+        return self._with_points(points + centre, centre, points) if any(centre) else self
 
-    def _in_frame(
-        self, vertices: Floats, hull: Floats, mass: Floats, centre: tuple[float, float, float], held: Floats | None
-    ) -> ObjectModel:
+    def _with_points(self, points: Floats, centre: tuple[float, float, float], held: Floats | None) -> ObjectModel:
+        vertices, hull, mass = points[: len(self.vertices)], points[len(self.vertices) : -1], points[-1]
         return replace(
             self, vertices=vertices, hull_vertices=hull, centre_of_mass=mass, centre=centre, about_centre=held
         )
