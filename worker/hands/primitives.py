@@ -103,10 +103,8 @@ def sample(
     # Stratified over the faces: each face gets its share of the number, rounded up or down.
     ladder = (np.arange(count) + rng.random()) / max(count, 1) * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder, side="right"), len(faces) - 1)
-    points, normals = (
-        points_on_faces(vertices[faces[face]], *rng.random((2, count, 1))),
-        face_vectors(vertices, faces[face]),
-    )
+    points = points_on_faces(vertices[faces[face]], *rng.random((2, count, 1)))
+    normals = face_vectors(vertices, faces[face])
     return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
@@ -132,8 +130,7 @@ def _sample_round(kind: str, size: tuple[float, ...], count: int, rng: np.random
 
 def signed_distance(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints, points: Floats) -> Floats:
     """Compute the distance (N,) of points (N, 3), negative inside.
-    Exact inside every kind and everywhere for spheres and capsules; outside boxes, cylinders and hulls it is a lower
-    bound with the right sign."""
+    Outside boxes, cylinders and hulls it is a lower bound with the right sign; elsewhere it is exact."""
     match kind:
         case "box":
             return (np.abs(points) - np.asarray(size) / 2).max(axis=1)

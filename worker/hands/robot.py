@@ -73,8 +73,7 @@ class Joint:
     upper: float = 0.0
     effort: float = 0.0  # limit [N m or N]; 0 if not stated
     mimic: Mimic | None = None
-    """Mimic relation. A URDF follower's own limits are ignored, as in ROS: most published limits of followers are
-    wrong."""
+    """Own limits of a URDF follower are ignored, as in ROS: most published ones are wrong."""
     velocity: float = 0.0  # limit [rad/s or m/s]; 0 if not stated
     stiffness: float = 0.0  # position gain of the joint's servo [N m/rad or N/m]; 0 if not stated
     armature: float = field(default=0.0, metadata=TOLD_IF_SET)
@@ -140,6 +139,7 @@ def _by_name(parts: Iterable[Any], duplicate: str) -> dict[str, Any]:
 
 
 def chain_to(robot: Robot, link: str) -> tuple[Joint, ...]:
+    """Return the joints from the robot's root to a link."""
     carrier = {joint.child: joint for joint in robot.joints.values()}
     found: list[Joint] = []
     while link in carrier:
@@ -159,13 +159,13 @@ def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str)
         parent_of[joint.child] = joint.parent
     roots = [name for name in links if name not in parent_of]
     if len(roots) != 1:
-        if not links:
+        if not links and filename.endswith(".xacro"):
             raise HandError(
                 f"{filename}: it expands to no link at all: it only defines macros (give the file that calls them), or "
                 "an <include> lacks its xacro: prefix"
-                if filename.endswith(".xacro")
-                else f"{filename}: it contains no link; give the description of a hand"
             )
+        if not links:
+            raise HandError(f"{filename}: it contains no link; give the description of a hand")
         found = ", ".join(map(repr, roots[:3])) or "none: the joints form a cycle"
         raise HandError(f"{filename}: a hand needs exactly one root link; found {found}")
     for link in links:
