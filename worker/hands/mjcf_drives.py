@@ -357,12 +357,10 @@ def driven_joints(model: Any, actuator: int) -> list[tuple[int, float]]:
 
 
 def joints_on_tendon(model: Any, tendon: int) -> list[tuple[int, float]]:
-    first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
-    return [
-        (int(model.wrap_objid[w]), float(model.wrap_prm[w]))
-        for w in range(first, first + count)
-        if model.wrap_type[w] == int(mujoco.mjtWrap.mjWRAP_JOINT)
-    ]
+    """Return the joints on a fixed tendon, each with its coefficient."""
+    first, kind = int(model.tendon_adr[tendon]), int(mujoco.mjtWrap.mjWRAP_JOINT)
+    wraps = [w for w in range(first, first + int(model.tendon_num[tendon])) if model.wrap_type[w] == kind]
+    return [(int(model.wrap_objid[w]), float(model.wrap_prm[w])) for w in wraps]
 
 
 def _driver(joint: int, mimics: Mapping[int, Mimic | float], joint_of: Mapping[str, int]) -> tuple[int | None, float]:

@@ -25,8 +25,7 @@ SEGMENTS = 32
 
 
 def hull(points: Floats) -> tuple[Floats, Ints]:
-    """Compute corners (V, 3) and outward triangles (F, 3) of the convex hull of points (N, 3).
-    Raises HandError: the points lie in a plane."""
+    """Compute corners (V, 3) and outward triangles (F, 3) of a hull of points (N, 3); HandError if flat."""
     made = cached_step("hull", [points], lambda: compute_hull(points))
     return made["0"], made["1"]
 

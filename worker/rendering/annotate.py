@@ -36,8 +36,7 @@ ALL: Final = "all"
 
 
 def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
-    """Return the channels in fixed order, without duplicates; `all` stands for every channel.
-    Raises InputError: a channel is unknown."""
+    """Return the channels in fixed order; `all` stands for every channel; InputError if one is unknown."""
     wanted = {word.strip() for word in words if word.strip()}
     if unknown := sorted(wanted - {*EXTRA_CHANNELS, ALL}):
         meant = did_you_mean(unknown[0], EXTRA_CHANNELS)

@@ -89,8 +89,7 @@ def rotate_about_vertical(pose: Floats, angle: float) -> Floats:
 
 
 def move_inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
-    """Move the pose to a random place in a rectangle x by y [m] about the origin.
-    Raises SceneError: the object does not fit."""
+    """Move a pose to a random place in a rectangle x by y [m] about the origin; SceneError if too small."""
     corners = quat_rotate(pose[3:], obj.hull_vertices)[:, :2]
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = np.asarray(size) / 2 - GAP

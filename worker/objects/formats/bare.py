@@ -158,9 +158,7 @@ class _Binary:
                 else:
                     self._take(np.dtype(self._order + p.type), 1)
         empty = [np.zeros(0, np.int64)]
-        return {
-            n: (np.array(counts[n], dtype=np.int64), np.concatenate(empty + items[n]).astype(np.int64)) for n in counts
-        }
+        return {n: (np.array(counts[n], np.int64), np.concatenate(empty + items[n]).astype(np.int64)) for n in counts}
 
     def _take(self, dtype: np.dtype, count: int) -> np.ndarray:
         if count < 0 or dtype.itemsize * count > len(self._body) - self._at:
