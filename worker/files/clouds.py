@@ -55,7 +55,6 @@ def stack_samples(samples: list[dict[str, Any]]) -> dict[str, Any]:
 
 #: Number of points on a hand: about 5 mm apart on a hand of human size.
 POINTS: Final = 2048
-_hands: LRUCache[Any, HandModel] = LRUCache(8)
 
 
 def hand_surface(shard: Shard, rows: NDArray[np.intp]) -> Floats:
@@ -67,6 +66,6 @@ def hand_surface(shard: Shard, rows: NDArray[np.intp]) -> Floats:
     return apply(body_poses(hand, pose, joints)[:, points.body], points.position)
 
 
-@cached(_hands, key=lambda shard: shard.attributes["hand_digest"])
+@cached(LRUCache(8), key=lambda shard: shard.attributes["hand_digest"])
 def _hand(shard: Shard) -> HandModel:
     return hand_of_shard(shard, None)

@@ -36,9 +36,8 @@ class Balance:
 
     def __post_init__(self) -> None:
         if unknown := [one for one in self.by if one not in KINDS]:
-            raise InputError(
-                f"grasps cannot be balanced by {unknown[0]!r}; choose from {choices_text(unknown[0], KINDS)}"
-            )
+            choices = choices_text(unknown[0], KINDS)
+            raise InputError(f"grasps cannot be balanced by {unknown[0]!r}; choose from {choices}")
         if not self.by:
             raise InputError(f"choose categories to balance: {', '.join(KINDS)}")
 

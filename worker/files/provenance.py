@@ -68,10 +68,8 @@ class AssetFiles:
 
 def path_attributes(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Attribute]:
     """Return root attributes with the paths of hand and object; built-in ones need none."""
-    found: dict[str, Attribute] = {}
-    for kind, path in (("hand", Path(hand)), ("object", Path(obj))):
-        if path.is_file():
-            found[f"{kind}_source"] = str(path.resolve())
+    paths = {"hand_source": Path(hand), "object_source": Path(obj)}
+    found: dict[str, Attribute] = {name: str(path.resolve()) for name, path in paths.items() if path.is_file()}
     return found | ({"object_options": json_attribute(dict(options))} if options else {})
 
 
@@ -134,6 +132,7 @@ def files_at(sought: AssetReference, path: Path) -> AssetFiles | None:
 
 
 def options_of(attribute: object) -> dict[str, Any]:
+    """Parse an attribute with a JSON object; empty if the attribute is absent or invalid."""
     try:
         said = from_json(str(attribute or "{}"))
     except ValueError:
@@ -147,8 +146,8 @@ _MATTER: Final = {"object_mass_kg": MASS_KG, "object_friction": FRICTION}
 
 
 def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
-    """Load the hand `given` (a file or a built-in); by default the shard's own, see `find_files`.
-    Raises NotFoundError: there is no such file, built-in or hand. ConflictError: it is not the shard's hand."""
+    """Load the hand `given` (a file or a built-in), by default the shard's own hand, see `find_files`.
+    Raises NotFoundError: no such hand. ConflictError: the given hand is not the shard's."""
     if given:
         hand = hand_from_path(given)
         _check_digest(shard, "hand", hand.digest, given)
@@ -159,6 +158,7 @@ def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
 
 
 def hand_files_of_shard(shard: Shard, given: str | None) -> AssetFiles:
+    """Load the files of the hand `given`, by default of the shard's own hand, see `find_files`."""
     if given:
         _, files, stated = hand_files(given)
         return AssetFiles(files, stated)
@@ -184,21 +184,19 @@ def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
 
 
 def _load_object(wanted: AssetReference, found: AssetFiles, face_error_m: float) -> ObjectModel:
-    return load_object(
-        found.files, name=wanted.name, digest=wanted.digest, face_error_m=face_error_m, options=found.options
-    )
+    name, digest, options = wanted.name, wanted.digest, found.options
+    return load_object(found.files, name=name, digest=digest, face_error_m=face_error_m, options=options)
 
 
 def _reference_of(shard: Shard, kind: AssetKind) -> AssetReference:
     said = shard.attributes
-    return AssetReference(
-        kind,
-        str(said.get(kind.value, "")),
-        str(said.get(f"{kind.value}_digest", "")),
-        str(said.get(f"{kind.value}_source", "")),
-        options_of(said.get(f"{kind.value}_options")),
-        None if shard.path is None else shard.path.resolve().parent,
-    )
+    name, digest, source = (str(said.get(f"{kind.value}{part}", "")) for part in ("", "_digest", "_source"))
+    options = options_of(said.get(f"{kind.value}_options"))
+    return AssetReference(kind, name, digest, source, options, _folder_of(shard))
+
+
+def _folder_of(shard: Shard) -> Path | None:
+    return None if shard.path is None else shard.path.resolve().parent
 
 
 def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None:
@@ -211,11 +209,9 @@ def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None
         raise ConflictError(f"the scene shard has {len(names)} neighbours; give each of them as --with, in their order")
     said = shard.attributes.get("neighbour_sources", [])
     sources = said if isinstance(said, list) else []
-    objects = (
-        [object_from_path(name, face_error_m=NEIGHBOUR_FACE_ERROR_M) for name in given]
-        if given
-        else [_load_neighbour(shard, *one) for one in zip_longest(names, digests, sources, fillvalue="")]
-    )
+    objects = [object_from_path(name, face_error_m=NEIGHBOUR_FACE_ERROR_M) for name in given] or [
+        _load_neighbour(shard, *one) for one in zip_longest(names, digests, sources, fillvalue="")
+    ]
     for obj, name, digest in zip(objects, names, digests, strict=True):
         if obj.digest != digest:
             raise ConflictError(
@@ -237,8 +233,7 @@ def neighbour_attributes(others: Sequence[ObjectModel], given: Sequence[str]) ->
 
 
 def _load_neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel:
-    folder = None if shard.path is None else shard.path.resolve().parent
-    wanted = AssetReference(AssetKind.OBJECT, name, digest, source, folder=folder)
+    wanted = AssetReference(AssetKind.OBJECT, name, digest, source, folder=_folder_of(shard))
     return _load_object(wanted, find_files(wanted), NEIGHBOUR_FACE_ERROR_M)
 
 
@@ -282,17 +277,8 @@ def source_attributes(source: Shard) -> dict[str, Attribute]:
 
 #: Attributes of the job that every later shard inherits.
 INHERITED: Final = (
-    "hand",
-    "hand_digest",
-    "hand_source",
-    "object",
-    "object_digest",
-    "object_source",
-    "object_options",
-    "method",
-    "fidelity",
-    "batch",
-    "root_link",
+    *("hand", "hand_digest", "hand_source", "object", "object_digest", "object_source", "object_options"),
+    *("method", "fidelity", "batch", "root_link"),
 )
 
 

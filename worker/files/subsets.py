@@ -60,8 +60,8 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
     for path, data in ready:
         (out / path).parent.mkdir(parents=True, exist_ok=True)
         (out / path).write_bytes(data)
-    told = {**said, "looked_at": looked_at, "kept": kept, "shards": [str(path) for path, _ in ready]}
-    (out / "subset.json").write_text(json.dumps(told, indent=1) + "\n")
+    summary = {**said, "looked_at": looked_at, "kept": kept, "shards": [str(path) for path, _ in ready]}
+    (out / "subset.json").write_text(json.dumps(summary, indent=1) + "\n")
     passed_over = len(shards) - len(shards.of("base"))
     return {"looked_at": looked_at, "kept": kept, "shards": len(ready), "passed_over": passed_over}
 
@@ -89,10 +89,8 @@ def select_grasps(base: Shard, *, unvalidated: bool = False, every: bool = False
 
 
 def _available_text(base: Shard, count: int) -> str:
-    waiting = int(validity.selection_mask(base.arrays, unvalidated=True).sum())
-    valid = int(validity.valid_mask(base.arrays).sum())
-    if waiting:
+    if waiting := int(validity.selection_mask(base.arrays, unvalidated=True).sum()):
         return f"{waiting} of its {count} are feasible but not validated: select them with --unvalidated"
-    if valid:
+    if valid := int(validity.valid_mask(base.arrays).sum()):
         return f"{valid} of its {count} are valid: leave out --unvalidated"
     return f"all {count} failed: select them with --all" if count else "it has no grasps"

@@ -50,6 +50,8 @@ Arrays = dict[str, NDArray[Any]]
 FREE: Final = SceneSpec()
 #: Scene columns that a shard contains.
 _KEPT: Final = ("scene/object_pose", "scene/rest_probability", "scene/neighbour_pose")
+#: Metrics with a mean in the summary, and the number of its digits.
+_MEANS: Final = {"epsilon": 4, "contact_area_cm2": 2, "intersection_volume_cm3": 4, "penetration_depth_mm": 3}
 
 
 @dataclass(frozen=True)
@@ -68,12 +70,12 @@ class SynthesisResult:
     @property
     def reason(self) -> str | None:
         """Explain why there are fewer grasps than requested; None if there are enough."""
-        request = self.request
+        request, count = self.request, len(self.arrays["quality/valid"])
         if self.interrupted:
-            return f"interrupted: {len(self.arrays['quality/valid'])} of {request.grasps} grasps were finished"
+            return f"interrupted: {count} of {request.grasps} grasps were finished"
         limit, narrow = self.limit, self.narrow
         reason = explain_shortfall(
-            len(self.arrays["quality/valid"]),
+            count,
             request.grasps,
             request.counted,
             sum(batch.candidates for batch in self.batches),
@@ -96,8 +98,9 @@ class SynthesisResult:
         return None if len(self.arrays["quality/valid"]) else self.batches[0].limit
 
     def summary(self) -> dict[str, Any]:
+        """Summarise the result: counts, settings, times and means."""
         count, request = len(self.arrays["quality/valid"]), self.request
-        told: dict[str, Any] = {
+        summary: dict[str, Any] = {
             "grasps": count,
             "candidates": sum(batch.candidates for batch in self.batches),
             "valid": int(self.arrays["quality/valid"].sum()),
@@ -111,33 +114,28 @@ class SynthesisResult:
             "outcomes": sum_outcomes(batch.outcomes for batch in self.batches),
             "seconds": round(self.seconds, 3),
             "grasps_per_second": round(count / self.seconds, 2),
-            "mean": {
-                "epsilon": self._mean("epsilon", 4),
-                "contact_area_cm2": self._mean("contact_area_cm2", 2),
-                "intersection_volume_cm3": self._mean("intersection_volume_cm3", 4),
-                "penetration_depth_mm": self._mean("penetration_depth_mm", 3),
-            },
+            "mean": {name: self._mean(name, digits) for name, digits in _MEANS.items()},
         }
         if request.measures_payload:
             payload = self._finite_values("payload_kg")
-            told["payload_kg"] = round(float(np.median(payload)), 4) if len(payload) else None
+            summary["payload_kg"] = round(float(np.median(payload)), 4) if len(payload) else None
         if request.shake:
             margin = self._finite_values("shake_margin")
-            told["shake_share"] = round(float((margin < 1).mean()), 4) if len(margin) else None
+            summary["shake_share"] = round(float((margin < 1).mean()), 4) if len(margin) else None
         if self.limit is not None:
-            told["limit"] = self.limit.facts()
-        told |= self._diversity()
+            summary["limit"] = self.limit.facts()
+        summary |= self._diversity()
         if request.models:
-            told |= {
+            summary |= {
                 "robust_models": request.models,
                 "robust_wanted": request.robust,
                 "robust_share": self._mean("robust_share", 4),
                 "not_robust": sum(batch.rejected.get("not_robust", 0) for batch in self.batches),
             }
         if self.place.kind != "free":
-            told |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
-            told |= {"rolling_scenes": self.rolling, "narrow": self.narrow}
-        return told
+            summary |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
+            summary |= {"rolling_scenes": self.rolling, "narrow": self.narrow}
+        return summary
 
     def _diversity(self) -> dict[str, Any]:
         types = np.bincount(np.asarray(self.arrays["quality/grasp_type"], int), minlength=len(GraspType))
@@ -202,10 +200,9 @@ def synthesize_grasps(
     partial: bool = False,
 ) -> SynthesisResult:
     """Make the grasps of a job in scene `place`; `hand` and `obj` are files or built-in names.
-    `mesh` has options for the object's file. `join` is the number of batches of 32 in one launch of the planner; None
-    for as many as fill a GPU. `processes` validate and measure; 1 for this process alone, 0 for `processes_at_once`.
-    Raises InputError: an invalid argument, or a scene without space. TaskCancelled: `cancelled` returned True; with
-    `partial`, only before any validation."""
+    `mesh` has options for the object's file. `join` batches are one launch of the planner; None fills a GPU.
+    `processes` validate and measure: 1 is this process alone, 0 stands for `processes_at_once`. Raises InputError: an
+    invalid argument, or a scene without space. TaskCancelled: cancelled; with `partial`, only before any validation."""
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
     if request.shake and place.kind == "free":
         raise InputError(SHAKE_NEEDS_A_SCENE)
@@ -272,7 +269,5 @@ def _attributes(
         "seconds": round(seconds, 4),
     }
     candidates = sum(batch.candidates for batch in batches)
-    outcomes = sum_outcomes(batch.outcomes for batch in batches)
-    return attributes | base_attributes(
-        hand, obj, request, candidates=candidates, verdict_key=batches[0].verdict_key, outcomes=outcomes
-    )
+    outcomes, key = sum_outcomes(batch.outcomes for batch in batches), batches[0].verdict_key
+    return attributes | base_attributes(hand, obj, request, candidates=candidates, verdict_key=key, outcomes=outcomes)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from graspd.service.model.errors import AssetError, InputError
+from graspd.service.model.errors import InputError
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.closing import chains_of
 from graspd.worker.hands.guess import guess_approach
@@ -32,7 +32,7 @@ def check_hand(
     options: Mapping[str, Any] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, Any]:
-    """Check whether the files describe a usable hand; `run` receives progress by link.
+    """Check whether the files describe a usable hand; report progress to `run`, link by link.
     Return verdict (accept or refuse), message (one line), repairs (always empty), and facts: measured or guessed
     values in SI units. If options can fix a refusal, facts have `problem` and `options_suggested` (`HandOptions`)."""
     try:
@@ -42,8 +42,7 @@ def check_hand(
         area = float(sample_surface(hand, _SURFACE_POINTS).area.sum())
         require_opposing(hand)
     except InputError as error:
-        facts = error.facts if isinstance(error, AssetError) else {}
-        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": facts}
+        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": getattr(error, "facts", {})}
     stated = {
         "palm": settings.palm is not None,
         "preshape": bool(settings.preshape),
@@ -51,7 +50,6 @@ def check_hand(
         "effort": not assumed_efforts(source, hand.dof_names),
     }
     tie = _approach_note(hand, settings)
-    fault = "" if hand.mounting else mounting_of(source, hand)[1]
     notes = [
         *robot.notes,
         *tie,
@@ -59,7 +57,7 @@ def check_hand(
         *_tendons(hand),
         *_limits(robot, settings),
         *_omitted_links(robot, hand, settings),
-        *_mounting(hand, fault),
+        *_mounting(source, hand),
     ]
     facts = {
         "links": len(robot.links),
@@ -111,19 +109,18 @@ def _limits(robot: Robot, settings: HandOptions) -> list[str]:
 def _omitted_links(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]:
     """Return notes on joints above the root: faulty ones if option `root` is set, else all moving ones."""
     chain = chain_to(robot, hand.root_link)
-    above = [joint.name for joint in chain if joint.type != "fixed"]
     if settings.root:
         return [f"{joint.name} ({joint.type}) above the palm taken as fixed" for joint in chain if joint.fault]
-    if not above:
-        return []
-    return [f"{', '.join(above)} above the palm left out; poses are those of {hand.root_link!r} (--root {robot.root})"]
+    above = ", ".join(joint.name for joint in chain if joint.type != "fixed")
+    note = f"{above} above the palm left out; poses are those of {hand.root_link!r} (--root {robot.root})"
+    return [note] if above else []
 
 
-def _mounting(hand: HandModel, fault: str) -> list[str]:
-    if fault:
-        return [fault]
-    links = () if hand.mounting is None else dict.fromkeys(piece.link for piece in hand.mounting.pieces)
-    return [f"{', '.join(links)} above the palm kept clear in scenes"] if links else []
+def _mounting(source: HandSource, hand: HandModel) -> list[str]:
+    if hand.mounting is None:
+        return [fault] if (fault := mounting_of(source, hand)[1]) else []
+    links = dict.fromkeys(piece.link for piece in hand.mounting.pieces)
+    return [f"{', '.join(links)} above the palm kept clear in scenes"]
 
 
 def model_facts(hand: HandModel) -> dict[str, Any]:

@@ -19,16 +19,14 @@ _PARALLEL: Final = 0.707
 _ABOUT: Final = 0.8
 #: A joint moves the tip if its tip motion exceeds this share of the largest tip motion by a joint of the finger.
 _MOVING: Final = 0.05
-#: Limits are symmetric if their middle is within this share of the range from 0. Such a joint stays straight: Shadow
-#: (with its thumb) and D'Claw lifted less when such joints closed.
+#: Limits are symmetric if their middle is within this share of the range from 0. Such joints stay straight.
 _EVEN: Final = 0.02
 #: Gains below this share of the tip's path length are a tie. Joints that oppose a thumb have .35 and more.
 _TIE: Final = 0.2
 
 
 def closing_by_limits(hand: HandModel) -> Floats:
-    """Return closing (D,) from limits: the sign of the larger limit if they are asymmetric, else 0.
-    Wrists have 0."""
+    """Return closing (D,): the sign of the larger limit if limits are asymmetric, else 0; 0 for wrists."""
     up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
     closing = np.where(up > FAR * down, 1.0, np.where(down > FAR * up, -1.0, 0.0))
     carrying = set(shared_bodies(hand))
@@ -40,10 +38,9 @@ def closing_by_limits(hand: HandModel) -> Floats:
 
 def closing_by_tips(hand: HandModel) -> Floats:
     """Return closing (D,) in -1, 0, +1 for a hand with fingertips, palm and a first guess of its closing.
-    Joints that are parallel to a finger's last joint flex the finger, unless their limits are symmetric. They flex in
-    the direction that brings the tip to the other tips and to the palm. Another joint closes if it brings the tip to
-    the other tips and away from the palm. It spreads if it turns about the approach or has symmetric limits. A joint in
-    line with its finger does neither."""
+    Joints parallel to a finger's last joint flex the finger, unless their limits are symmetric. They close in the
+    direction that brings the tip to the other tips and to the palm. Other joints close if they bring the tip to the
+    other tips and ahead, unless they turn about the approach or have symmetric limits."""
     limits, (flexing, opposing, ways) = closing_by_limits(hand), _gains(hand)
     postures = (hand.expand(closing_posture(hand, share)) for share in (0.0, 0.5))
     opened, half = (quat_rotate(body_poses(hand, IDENTITY_POSE, q)[0, :, 3:], hand.axis) for q in postures)
@@ -73,9 +70,8 @@ def closing_by_tips(hand: HandModel) -> Floats:
 
 def _gains(hand: HandModel) -> tuple[Floats, Floats, Floats]:
     """Measure the effect of each dof on each fingertip over the dof's range from lower to upper limit.
-    Return three arrays (D, T) [m], summed over postures of the other dofs. First: decrease of the distances to the
-    other tips and to the palm. Second: decrease of the distance to the other tips, plus motion along the palm's
-    approach. Third: length of the tip's path."""
+    Return three arrays (D, T) [m], summed over postures of the other dofs: decrease of the distances to the other tips
+    and to the palm; decrease of the distance to the other tips, plus motion along the approach; the path's length."""
     flexing, opposing, ways = np.zeros((3, hand.dofs, len(hand.fingertips)))
     for share in _SHARES:
         for dof in range(hand.dofs):
@@ -98,10 +94,8 @@ def _tip_distances(tip: Floats) -> Floats:
 
 def chains_of(hand: HandModel) -> list[list[int]]:
     """Return the bodies whose joints move each fingertip, the last one first, up to the palm."""
-    carrying = set(shared_bodies(hand))
-    return [
-        [body for body in hand.chain(tip) if body not in carrying and hand.dof[body] >= 0] for tip in hand.fingertips
-    ]
+    own = set(range(1, hand.bodies)) - set(shared_bodies(hand))
+    return [[body for body in hand.chain(tip) if body in own] for tip in hand.fingertips]
 
 
 def shared_bodies(hand: HandModel) -> list[int]:
@@ -113,7 +107,7 @@ def shared_bodies(hand: HandModel) -> list[int]:
 
 
 def closing_posture(hand: HandModel, share: float | Floats) -> Floats:
-    """Return the posture (..., D) at shares (..., 1) from open (0) to closed (1); other dofs stay near 0."""
+    """Return postures (..., D) at shares (..., 1) from open (0) to closed (1); other dofs stay near 0."""
     start = np.where(hand.closing < 0, hand.upper, hand.lower)
     end = np.where(hand.closing < 0, hand.lower, hand.upper)
     rest = np.clip(0.0, hand.lower, hand.upper)

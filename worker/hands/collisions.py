@@ -18,15 +18,9 @@ TOUCH_M = 1e-4
 def resting_neighbours(hand: HandModel) -> frozenset[tuple[int, int]]:
     """Return pairs of bodies (a < b): parent or grandparent and child, and those that touch at rest.
     Rest means both the pre-shape and the middle of the limits: bodies that touch in both cannot be separated."""
-    pairs: set[tuple[int, int]] = set()
-    for body in range(1, hand.bodies):
-        parent = int(hand.parent[body])
-        pairs.add((parent, body))
-        if parent > 0:
-            pairs.add((int(hand.parent[parent]), body))
-    postures = (hand.preshape, (hand.lower + hand.upper) / 2)
-    touching = [touching_bodies(hand, q, TOUCH_M) for q in postures]
-    return frozenset(pairs | (touching[0] & touching[1]))
+    near = {(above, body) for body in range(1, hand.bodies) for above in [*hand.chain(body), 0][1:3]}
+    open_, middle = (touching_bodies(hand, q, TOUCH_M) for q in (hand.preshape, (hand.lower + hand.upper) / 2))
+    return frozenset(near | (open_ & middle))
 
 
 def touching_bodies(hand: HandModel, q: Floats, margin: float) -> set[tuple[int, int]]:
@@ -46,8 +40,7 @@ def touching_bodies(hand: HandModel, q: Floats, margin: float) -> set[tuple[int,
 
 def hull_distance(a: Floats, b: Floats) -> float:
     """Compute the distance [m] of the convex hulls of two point sets (N, 3) and (M, 3); 0 if they overlap.
-    Least squares over convex weights x, y: min |a'x - b'y| with sum x = sum y = 1. The sums are rows of large
-    weight."""
+    Least squares over convex weights x, y: min |a'x - b'y|; rows of large weight keep sum x = sum y = 1."""
     return float(cached_step("distance", [a, b], lambda: [_hull_distance(a, b)])["0"])
 
 
@@ -58,9 +51,7 @@ def _hull_distance(a: Floats, b: Floats) -> Floats:
     middle = a.mean(axis=0)
     weight = 1e3
     rows = np.zeros((5, len(a) + len(b)))
-    rows[:3, : len(a)] = (a - middle).T / scale
-    rows[:3, len(a) :] = -(b - middle).T / scale
-    rows[3, : len(a)] = weight
-    rows[4, len(a) :] = weight
+    rows[:3] = np.concatenate([a - middle, -(b - middle)]).T / scale
+    rows[3, : len(a)] = rows[4, len(a) :] = weight
     solution, _ = nnls(rows, np.array([0, 0, 0, weight, weight]), maxiter=20 * rows.shape[1])
     return np.asarray(np.linalg.norm(rows[:3] @ solution) * scale)

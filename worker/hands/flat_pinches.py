@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, SurfacePoints
 from graspd.worker.hands.pinch_postures import Oppositions, improve_postures, opposed_finger, random_postures
@@ -33,8 +33,8 @@ _TIP_POINTS: Final = 120
 _OTHER_POINTS: Final = 20
 _DENSE: Final = 8000
 #: A fingertip that ends above the plane by more than this share of the height misses the object.
-#: The second value scales differences of width in the cost [m].
 REACHES: Final = 0.4
+#: Difference of width that costs 1 [m].
 WIDTH_M: Final = 0.02
 #: Least height of the rest of the hand above the plane [m].
 OVER_M: Final = 0.008
@@ -52,25 +52,20 @@ def flat_pinches(hand: HandModel, height: float) -> Oppositions:
 
 @cached_by_content(32)
 def _cached_pinches(hand: HandModel, height: float) -> Oppositions:
-    key, code = (hand.content, str(height)), sys.modules[__name__]
-    return Oppositions.cached("pinches", key, lambda: _pinches(hand, height), code)
+    key = (hand.content, str(height))
+    return Oppositions.cached("pinches", key, lambda: _pinches(hand, height), sys.modules[__name__])
 
 
 def _pinches(hand: HandModel, height: float) -> Oppositions:
-    one, look = opposed_finger(hand), _PinchSearch.of(hand, height)
+    one, look = opposed_finger(hand), _PinchSearch(hand, height)
     q = random_postures(hand, one, CROWD * POSTURES)
     wanted = np.linspace(*WIDTHS_M, POSTURES)
     cost = look.at(q, one).cost(np.repeat(wanted, CROWD))
     q = q[np.arange(POSTURES) * CROWD + cost.reshape(POSTURES, CROWD).argmin(axis=1)]
     q = improve_postures(hand, one, q, lambda tried: look.at(tried, one).cost(wanted))
     seen = look.at(q, one)
-    good = np.flatnonzero(
-        (seen.short < 1.0)
-        & (seen.facing > FACING)
-        & (seen.square < SQUARE)
-        & (seen.over > OVER_M)
-        & (seen.width > WIDTHS_M[0])
-    )
+    faces = (seen.facing > FACING) & (seen.square < SQUARE)
+    good = np.flatnonzero(faces & (seen.short < 1.0) & (seen.over > OVER_M) & (seen.width > WIDTHS_M[0]))
     return Oppositions.of(q, seen, good if len(good) >= FEW else good[:0])
 
 
@@ -82,64 +77,42 @@ class _Evaluation:
     middle: Floats
     width: Floats
     short: Floats
-    """(N,) ratio of the ends' height above the plane to the largest height that reaches the object. The larger value of
-    the opposing end and of the other ends' mean counts."""
+    """(N,) height of the ends above the plane, relative to the largest height that reaches the object.
+    The larger value counts, that of the opposing end or the mean of the other ends."""
     facing: Floats
-    """(N,) cosine of the surface normals within the height with the line between the ends; the lower value of both
-    sides."""
+    """(N,) cosine between the line of the ends and the normals within the height; the lower value of both sides."""
     square: Floats
-    over: Floats
-    """(N,) height of the rest of the hand above the plane [m]."""
+    over: Floats  # (N,) height of the rest of the hand above the plane [m]
 
     def cost(self, wanted: Floats) -> Floats:
         """Return the cost (N,) of postures as pinches of the widths `wanted` (N,)."""
         short = np.maximum(0.0, self.short - 0.5)
         low = np.maximum(0.0, OVER_M + 0.005 - self.over) / WIDTH_M
         aside = 2 * np.maximum(0.0, self.square - 0.9 * SQUARE)
-        return np.asarray(
-            2 * short - 2 * np.minimum(self.facing, 0.95) + np.abs(self.width - wanted) / WIDTH_M + low + aside
-        )
+        facing = 2 * short - 2 * np.minimum(self.facing, 0.95)
+        return np.asarray(facing + np.abs(self.width - wanted) / WIDTH_M + low + aside)
 
 
-@dataclass(frozen=True)
 class _PinchSearch:
-    """Surface of a hand as points of its fingertips and of the rest."""
+    """Evaluates pinches of a hand by points on its fingertips and on its other bodies."""
 
-    hand: HandModel
-    height: float
-    tips: Floats
-    """(F, V, 3) body frame [m]."""
-    normals: Floats
-    """(F, V, 3)"""
-    others: Floats
-    """(W, 3) body frame [m]."""
-    body: NDArray[np.intp]
-    """(W,) bodies of the other points."""
-
-    @classmethod
-    def of(cls, hand: HandModel, height: float) -> _PinchSearch:
+    def __init__(self, hand: HandModel, height: float) -> None:
+        self.hand, self.height = hand, height
         points = sample_surface(hand, _DENSE)
         tips = [_spread(points, tip, _TIP_POINTS) for tip in hand.fingertips]
         mine = np.stack([np.resize(some, _TIP_POINTS) for some in tips])
         others = np.setdiff1d(points.body, hand.fingertips).tolist()
         rest = np.concatenate([_spread(points, body, _OTHER_POINTS) for body in others])
-        return cls(
-            hand,
-            height,
-            points.position[mine],
-            points.normal[mine],
-            points.position[rest],
-            points.body[rest].astype(np.intp),
-        )
+        self.tips, self.normals = points.position[mine], points.normal[mine]  # (F, V, 3) body frames [m]
+        self.others, self.body = points.position[rest], points.body[rest].astype(np.intp)  # (W, 3), (W,)
 
     def at(self, q: Floats, one: int) -> _Evaluation:
         """Evaluate the pinch between the finger `one` and the others in postures (N, D)."""
         hand, others = self.hand, [f for f in range(len(self.tips)) if f != one]
         bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
         tips = bodies[:, list(hand.fingertips), None]
-        place = quat_rotate(tips[..., 3:], self.tips) + tips[..., :3]
-        normal = quat_rotate(tips[..., 3:], self.normals)
-        down, axis, ends = np.tile(hand.palm.approach, (len(q), 1)), np.zeros((len(q), 3)), np.zeros((len(q), 0))
+        place, normal = apply(tips, self.tips), quat_rotate(tips[..., 3:], self.normals)
+        down = np.tile(hand.palm.approach, (len(q), 1))
         # The plane and the points that touch it depend on each other.
         for _ in range(3):
             low = np.einsum("nfvi,ni->nfv", place, down).argmax(axis=2)
@@ -168,8 +141,7 @@ class _PinchSearch:
             + (plane - 0.5 * self.height)[:, None] * down
             + np.einsum("ni,ni->n", end[:, one] + end[:, others].mean(axis=1), across)[:, None] * 0.5 * across
         )
-        rest = bodies[:, self.body]
-        lowest = np.einsum("nvi,ni->nv", quat_rotate(rest[..., 3:], self.others) + rest[..., :3], down).max(axis=1)
+        lowest = np.einsum("nvi,ni->nv", apply(bodies[:, self.body], self.others), down).max(axis=1)
         return _Evaluation(axis, middle, width, short, facing, np.abs(axis @ hand.palm.approach), plane - lowest)
 
 

@@ -2,7 +2,7 @@
 
 An object of 10 mm is held between the sides of two fingers, or between a finger and the palm. An object as wide as the
 hand's span is held between the sides of fingertips. In both cases two surface points have normals along the line
-between them. A cube as wide as their distance fits between them. Sampling and random steps find such pairs."""
+between them, and a cube fits between them. Sampling and random steps find such pairs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
 from graspd.worker.hands import digits
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
 from graspd.worker.hands.model import HandModel, SurfacePoints
@@ -34,8 +34,8 @@ POINTS: Final = {"small": 256, "wide": 640}
 POSTURES: Final = 120
 CROWD: Final = 8
 CLIMBS: Final = 80
-#: Least cosine of both surface normals with the line between the points. Cost of a cosine that is lower by 1 [m], and
-#: cost per metre of penetration of the hand into the cube between the points.
+#: Least cosine of both normals with the line between the points; costs of a lower cosine [m], and of a metre of
+#: penetration of the hand into the cube between the points.
 FACING: Final = {"small": 0.9, "wide": 0.8}
 TURNED_M: Final = 0.2
 DEEP: Final = 2.0
@@ -64,9 +64,8 @@ _NEXT_TO: Final = 1e-9
 @cached_by_content(32)
 def postures_for_size(hand: HandModel, size: Size) -> Oppositions:
     """Return postures for small or wide objects, cached in memory and on disk."""
-    return Oppositions.cached(
-        "spans", (hand.content, size), lambda: _search_postures(hand, size), sys.modules[__name__]
-    )
+    key = (hand.content, size)
+    return Oppositions.cached("spans", key, lambda: _search_postures(hand, size), sys.modules[__name__])
 
 
 @cached_by_content(16)
@@ -118,6 +117,7 @@ class _BestPairs:
     cost: Floats
 
     def take(self, rows: NDArray[np.bool_], other: _BestPairs) -> None:
+        """Replace the rows of a mask (N,) by those of `other`."""
         for mine, its in zip(vars(self).values(), vars(other).values(), strict=True):
             mine[rows] = its[rows]
 
@@ -158,8 +158,7 @@ class _PairSearch:
         hand, points = self.hand, self.points
         bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
         pose = bodies[:, points.body]
-        place = quat_rotate(pose[..., 3:], points.position) + pose[..., :3]
-        normal = quat_rotate(pose[..., 3:], points.normal)[:, self.holding]
+        place, normal = apply(pose, points.position), quat_rotate(pose[..., 3:], points.normal)[:, self.holding]
         held = place[:, self.holding]
         costs = self._costs(held, normal, wanted)
         close = np.argpartition(costs, CLOSELY, axis=1)[:, :CLOSELY]
@@ -172,10 +171,8 @@ class _PairSearch:
         cost += DEEP * self._penetration(place, axis, *ends, width)
         parts = self.holding[one], self.holding[other]
         cost += np.maximum(0.0, CLOSES_M - self._closing_distance(q, bodies, axis, parts, ends))
-        best = cost.argmin(axis=1)
-        row = np.arange(len(q))
-        middle = 0.5 * (ends[0] + ends[1])
-        return axis[row, best], middle[row, best], width[row, best], cost[row, best]
+        best = np.arange(len(q)), cost.argmin(axis=1)
+        return axis[best], 0.5 * (ends[0] + ends[1])[best], width[best], cost[best]
 
     def _costs(self, held: Floats, normal: Floats, wanted: Floats) -> Floats:
         """Compute the cost (n, pairs) of each pair by matrix products, without penetration and closing motion.
@@ -206,11 +203,9 @@ class _PairSearch:
         """Return the distance (n, K) by which two points can approach each other, to first order [m]."""
         hand, rate = self.hand, np.zeros((*axis.shape[:2], self.hand.dofs))
         for part, end, sign in zip(parts, ends, (-1.0, 1.0), strict=True):
-            moves = generalized_forces(hand, bodies, self.points.body[part], end, axis[:, :, None])[:, :, 0]
-            rate += sign * moves
+            rate += sign * generalized_forces(hand, bodies, self.points.body[part], end, axis[:, :, None])[:, :, 0]
         room = np.where(rate < 0, (hand.upper - q)[:, None], (q - hand.lower)[:, None])
-        nearer: Floats = np.where(np.abs(rate) > LEVER_M, np.abs(rate) * room, 0.0).sum(axis=2)
-        return nearer
+        return np.asarray(np.where(np.abs(rate) > LEVER_M, np.abs(rate) * room, 0.0).sum(axis=2))
 
     def _penetration(self, place: Floats, axis: Floats, one: Floats, other: Floats, width: Floats) -> Floats:
         """Return the penetration (n, K) of the hand into cubes between two of its points [m]."""
@@ -228,9 +223,7 @@ class _PairSearch:
         aside -= np.einsum("nki,nki->nk", across, middle)[..., None]
         above -= (start + half)[..., None]
         beside = np.maximum(np.maximum(np.abs(along), np.abs(aside)), np.abs(above))
-        inside = half[..., None] - beside
-        deepest: Floats = np.maximum(inside, 0.0).max(axis=2)
-        return deepest
+        return np.asarray(np.maximum(half[..., None] - beside, 0.0).max(axis=2))
 
 
 def _flatness(hand: HandModel, points: SurfacePoints) -> Floats:
@@ -249,5 +242,4 @@ def _flatness(hand: HandModel, points: SurfacePoints) -> Floats:
 def _perpendicular(axis: Floats) -> Floats:
     helper = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
     across = np.cross(axis, helper)
-    unit: Floats = across / np.linalg.norm(across, axis=-1, keepdims=True)
-    return unit
+    return np.asarray(across / np.linalg.norm(across, axis=-1, keepdims=True))

@@ -10,13 +10,8 @@ import numpy as np
 
 from graspd.service.model.errors import HandError, did_you_mean
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_rotate
-from graspd.worker.hands.closing import (
-    closing_by_limits,
-    closing_by_tips,
-    closing_posture,
-    shared_bodies,
-    tip_positions,
-)
+from graspd.worker.hands import closing
+from graspd.worker.hands.closing import closing_posture, shared_bodies, tip_positions
 from graspd.worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, prismatic_dofs, sign_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, PalmFrame
@@ -51,7 +46,7 @@ def complete_hand(hand: HandModel, tree: Tree, options: HandOptions) -> HandMode
     """Fill in fingertips, closing, palm and preshape of the hand: as stated, else as guessed."""
     hand = replace(hand, fingertips=_fingertips(hand, tree, options))
     stated = dict(_by_dof(hand, tree, options.closing))
-    hand = replace(hand, closing=closing_by_limits(hand))
+    hand = replace(hand, closing=closing.closing_by_limits(hand))
     slide = prismatic_dofs(hand)
     if hand.dofs <= MAX_DOFS or slide.any():
         seen = replace(hand, closing=_gripper_closing(hand, stated))
@@ -61,16 +56,16 @@ def complete_hand(hand: HandModel, tree: Tree, options: HandOptions) -> HandMode
         hand = replace(hand, closing=np.where(slide, seen.closing, hand.closing))
     for _ in range(LOOKS):
         hand = _with_palm(hand, tree, options)
-        hand = replace(hand, closing=np.where(slide, hand.closing, closing_by_tips(hand)))
+        hand = replace(hand, closing=np.where(slide, hand.closing, closing.closing_by_tips(hand)))
     # A joint's stated closing does not change the guess for another joint.
     return _with_palm(replace(hand, closing=_override(hand.closing, stated)), tree, options)
 
 
-def _override(closing: Floats, stated: Mapping[int, float]) -> Floats:
-    closing = closing.copy()
+def _override(guessed: Floats, stated: Mapping[int, float]) -> Floats:
+    result = guessed.copy()
     for dof, direction in stated.items():
-        closing[dof] = np.sign(direction)
-    return closing
+        result[dof] = np.sign(direction)
+    return result
 
 
 def _with_palm(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
@@ -89,33 +84,28 @@ def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> H
     pads = tuple(body for side in jaws.bodies for body in side if body > 0)
     hand = replace(hand, fingertips=hand.fingertips if options.fingertips else pads)
     hand = replace(hand, preshape=_preshape(hand, tree, options, share=0.0))
-    if options.palm is None:
-        between = jaws.middle[len(jaws.middle) // 2]
-        corners = [piece.vertices for piece in hand.pieces if piece.body == 0]
-        height = float((np.concatenate(corners) @ approach).max()) if corners else 0.0
-        # If one jaw is part of the palm, the palm ends at the pads.
-        centre = between + min(height - float(between @ approach), 0.0) * approach
-        return replace(hand, palm=PalmFrame(centre, approach))
-    return replace(hand, palm=_palm(hand, tree, options, approach))
+    if options.palm is not None:
+        return replace(hand, palm=_palm(hand, tree, options, approach))
+    between = jaws.middle[len(jaws.middle) // 2]
+    corners = [piece.vertices for piece in hand.pieces if piece.body == 0]
+    height = float((np.concatenate(corners) @ approach).max()) if corners else 0.0
+    # If one jaw is part of the palm, the palm ends at the pads.
+    centre = between + min(height - float(between @ approach), 0.0) * approach
+    return replace(hand, palm=PalmFrame(centre, approach))
 
 
 def _approach_of_jaws(hand: HandModel, jaws: Jaws) -> Floats:
-    """Return the approach of a gripper: perpendicular to the closing line and the axes of hinges."""
-    ahead, axis = _unit(_pad_direction(hand, jaws)), jaws.axis[len(jaws.q) // 2]
+    """Return a gripper's approach: from palm to pads, perpendicular to closing line and axes of hinges."""
+    half = len(jaws.q) // 2
+    poses, axis = body_poses(hand, IDENTITY_POSE, hand.expand(jaws.q[half]))[0], jaws.axis[half]
+    palm = [piece.vertices.mean(axis=0) for piece in hand.pieces if piece.body == 0]
+    bases = [poses[b, :3] for b in range(1, hand.bodies) if hand.parent[b] == 0]
+    way = jaws.middle[half] - np.mean(palm or bases, axis=0)
+    ahead = _unit(way - (way @ axis) * axis)
     if (line := _common_direction(hand, ahead, ROUGH, 2, axis)) is not None:
         return line
     # A root frame that is not aligned with the closing line does not suggest an approach.
     return _snap_to_axis(ahead) if _angle(axis, _root_axis(axis)) < GOOD else ahead
-
-
-def _pad_direction(hand: HandModel, jaws: Jaws) -> Floats:
-    """Return the direction from the palm to the point between the pads, perpendicular to the closing line."""
-    half = len(jaws.q) // 2
-    poses = body_poses(hand, IDENTITY_POSE, hand.expand(jaws.q[half]))[0]
-    palm = [piece.vertices.mean(axis=0) for piece in hand.pieces if piece.body == 0]
-    bases = [poses[b, :3] for b in range(1, hand.bodies) if hand.parent[b] == 0]
-    way = jaws.middle[half] - np.mean(palm or bases, axis=0)
-    return np.asarray(way - (way @ jaws.axis[half]) * jaws.axis[half])
 
 
 def _gripper_closing(hand: HandModel, stated: Mapping[int, float]) -> Floats:
@@ -135,17 +125,15 @@ def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int,
     for name in options.fingertips:
         if name not in tree.known:
             raise HandError(f"the hand has no link {name!r} to be a fingertip{did_you_mean(name, tree.links)}")
-    kept = [tree.links[name][0] for name in options.fingertips if name in tree.links]
-    if kept:
-        return tuple(dict.fromkeys(kept))
-    return tuple(body for body in range(1, hand.bodies) if body not in set(hand.parent.tolist()))
+    stated = [tree.links[name][0] for name in options.fingertips if name in tree.links]
+    leaves = [body for body in range(1, hand.bodies) if body not in hand.parent]
+    return tuple(dict.fromkeys(stated or leaves))
 
 
 def guess_approach(hand: HandModel) -> tuple[Floats, bool]:
     """Return the direction out of the palm, and whether both sides of the palm are equally likely.
-    Two estimates are added, since their sum has the smallest error. The mean motion of the fingertips during closing
-    points out of a human-like palm. The half-closed tips lie ahead of a gripper's palm, but far along the fingers of a
-    human-like hand. If fingers oppose each other, the tip motions cancel to a sideways residual or rounding noise: see
+    The direction is the sum of two estimates. The mean motion of the closing fingertips points out of a human-like
+    palm. The half-closed tips lie ahead of a gripper's palm. If fingers oppose each other, their motions cancel: see
     `_approach_between_fingers`."""
     ways, ahead = _tip_motions(hand), _unit(_palm_to_tips(hand))
     if _residual_motion(ways, ahead) < OPPOSED:
@@ -164,11 +152,10 @@ def _tip_motions(hand: HandModel) -> Floats:
 def _palm_to_tips(hand: HandModel) -> Floats:
     """Return the vector (3,) from the middle of the palm to the middle of the half-closed hand's tips."""
     body = shared_bodies(hand)[-1]
-    pose = body_poses(hand, IDENTITY_POSE, hand.expand(closing_posture(hand, 0.6)))[0, body]
+    q = closing_posture(hand, 0.6)
+    pose = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0, body]
     palm = [apply(pose, piece.vertices.mean(axis=0)) for piece in hand.pieces if piece.body == body]
-    return np.asarray(
-        tip_positions(hand, closing_posture(hand, 0.6)).mean(axis=0) - (np.mean(palm, axis=0) if palm else pose[:3])
-    )
+    return np.asarray(tip_positions(hand, q).mean(axis=0) - np.mean(palm or [pose[:3]], axis=0))
 
 
 def _residual_motion(ways: Floats, ahead: Floats) -> float:
@@ -181,7 +168,7 @@ def _residual_motion(ways: Floats, ahead: Floats) -> float:
 
 def _approach_between_fingers(hand: HandModel) -> tuple[Floats, bool]:
     """Return the direction out of the palm between opposed fingers, and whether its sign is a tie.
-    It runs from finger bases to half-closed tips, normal to a common closing line. Coplanar points give a tie."""
+    The direction is from finger bases to half-closed tips, normal to any common closing line; a tie if coplanar."""
     body = shared_bodies(hand)[-1]
     q = closing_posture(hand, 0.5)
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
@@ -190,7 +177,7 @@ def _approach_between_fingers(hand: HandModel) -> tuple[Floats, bool]:
     spread = float(np.linalg.norm(bases - bases.mean(axis=0), axis=1).max())
     tied = bool(np.linalg.norm(along) < LEAST_AHEAD * max(spread, 1e-6))
     if tied:
-        # The plane's normal has no preferred side: one is chosen and reported as a tie.
+        # The plane's normal has no preferred sign: the sign is arbitrary and reported as a tie.
         normal = np.linalg.svd(np.vstack([bases, ends]) - bases.mean(axis=0))[2][-1]
         along = normal * sign_of(normal)
     else:
@@ -220,10 +207,10 @@ def _common_direction(
     lines = lines * np.where(lines @ rough < 0, -1.0, 1.0)[:, None]
     lines = lines[lines @ rough > np.cos(np.deg2rad(within))]
     alike = lines @ lines.T > np.cos(np.deg2rad(SAME_LINE))
-    if not len(lines) or alike.sum(axis=1).max() < least:
+    shared = alike.sum(axis=1)
+    if shared.max(initial=0) < least:
         return None
-    mean = _unit(lines[alike[int(np.argmax(alike.sum(axis=1)))]].mean(axis=0))
-    return _snap_to_axis(mean, SAME_LINE)
+    return _snap_to_axis(_unit(lines[alike[int(np.argmax(shared))]].mean(axis=0)), SAME_LINE)
 
 
 def _snap_to_axis(mean: Floats, within: float = ROUGH) -> Floats:
@@ -276,8 +263,7 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
     if options.palm and options.palm.centre is not None:
         return PalmFrame(apply(pose, np.asarray(options.palm.centre)), approach)
     if options.palm is None:
-        children = np.bincount(hand.parent[1:], minlength=hand.bodies)
-        body = int(np.argmax(children))
+        body = int(np.argmax(np.bincount(hand.parent[1:], minlength=hand.bodies)))
     parts = [apply(poses[body], p.vertices) for p in hand.pieces if p.body == body]
     bases = poses[[b for b in range(1, hand.bodies) if hand.parent[b] == body], :3]
     corners = np.concatenate(parts) if parts else poses[body, None, :3]
@@ -301,8 +287,7 @@ def _exit_distance(parts: Sequence[Floats], point: Floats, direction: Floats) ->
     for corners in parts:
         planes = cached_step("planes", [corners], partial(_planes, corners))["0"]
         rate, room = planes[:, :3] @ direction, -(planes[:, :3] @ point + planes[:, 3])
-        # Planes parallel to the line bound nothing. If such a plane excludes the point, the line does not meet its
-        # part.
+        # A plane parallel to the line has no intersection; if it excludes the point, the line misses the part.
         across = np.abs(rate) > 1e-9
         first = np.max(room[across & (rate < 0)] / rate[across & (rate < 0)], initial=-np.inf)
         last = np.min(room[across & (rate > 0)] / rate[across & (rate > 0)], initial=np.inf)

@@ -10,16 +10,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.service.model import transforms
 from graspd.service.model.errors import InputError
-from graspd.service.model.transforms import (
-    IDENTITY_POSE,
-    Floats,
-    apply,
-    compose,
-    invert,
-    quat_from_axis_angle,
-    quat_from_matrix,
-)
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose, invert
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 
@@ -29,11 +22,9 @@ POSTURES: Final = 200
 _FITTED: Final = 40
 #: Largest distance of corresponding fingertips in models of one hand [m].
 TOLERANCE_M: Final = 1e-3
-#: Weight of a prior on fingertip positions in the other model, for hands with little motion: a gripper's jaws only
-#: translate. The prior moves every fingertip by less than a nanometre in all postures.
+#: Weight of a prior on fingertip positions in the other model: fits of grippers need it; it moves tips by nanometres.
 _PRIOR: Final = 1e-3
-#: Largest number of evaluations of a fit. By then, a fit between models of the same hand has converged or is as good as
-#: needed.
+#: Largest number of evaluations of a fit: enough for models of the same hand.
 _LOOKS: Final = 15
 
 
@@ -43,12 +34,9 @@ class HandMatch:
 
     ours: HandModel
     theirs: HandModel
-    joints: NDArray[np.intp]
-    """(J',) index of the matching joint of `ours` for each joint of `theirs`."""
-    base: Floats
-    """(7,) pose of the root of `theirs` in the root frame of `ours`."""
-    fingertips_m: float
-    """Largest distance of corresponding fingertips over random postures [m]."""
+    joints: NDArray[np.intp]  # (J',) index of the matching joint of `ours` for each joint of `theirs`
+    base: Floats  # (7,) pose of the root of `theirs` in the root frame of `ours`
+    fingertips_m: float  # largest distance of corresponding fingertips over random postures [m]
 
     @cached_property
     def bodies(self) -> NDArray[np.intp]:
@@ -68,12 +56,7 @@ class HandMatch:
 
 
 def match_hands(
-    ours: HandModel,
-    theirs: HandModel,
-    joint_map: Mapping[str, str] | None = None,
-    *,
-    tolerance_m: float = TOLERANCE_M,
-    seed: int = 0,
+    ours: HandModel, theirs: HandModel, joint_map: Mapping[str, str] | None = None, *, tolerance_m: float = TOLERANCE_M
 ) -> HandMatch:
     """Match two models of a hand: `ours`, for which grasps were planned, and `theirs`.
     Joints are matched by `joint_map` (ours to theirs) or name, ignoring case and a common prefix of all names of a hand
@@ -82,8 +65,7 @@ def match_hands(
     Raises InputError: a joint has no match in the other model, or fingertips differ by more than `tolerance_m` [m]."""
     joints = _matching_bodies(ours, theirs, joint_map or {})
     tips = [body for body in ours.fingertips if body]
-    rng = np.random.default_rng(seed)
-    mine = ours.expand(rng.uniform(ours.lower, ours.upper, (POSTURES, ours.dofs)))
+    mine = ours.expand(np.random.default_rng(0).uniform(ours.lower, ours.upper, (POSTURES, ours.dofs)))
     here = body_poses(ours, np.tile(IDENTITY_POSE, (POSTURES, 1)), mine)
     there = body_poses(theirs, np.tile(IDENTITY_POSE, (POSTURES, 1)), mine[:, joints])
     twins = dict(zip(ours.joint_body[joints].tolist(), theirs.joint_body.tolist(), strict=True))
@@ -153,7 +135,7 @@ def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
     def pose_of(x: Floats) -> Floats:
         angle = float(np.linalg.norm(x[3:6]))
         axis = x[3:6] / angle if angle > 0 else np.array([1.0, 0, 0])
-        turn = np.concatenate([np.zeros(3), quat_from_axis_angle(axis, np.asarray(angle))])
+        turn = np.concatenate([np.zeros(3), transforms.quat_from_axis_angle(axis, np.asarray(angle))])
         return compose(np.concatenate([start[:3] + x[:3], start[3:]]), turn)
 
     def gap(x: Floats) -> Floats:
@@ -162,9 +144,8 @@ def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
     def residual(x: Floats) -> Floats:
         return np.concatenate([gap(x).ravel(), _PRIOR * (x[6:] - guess.ravel())])
 
-    found = least_squares(
-        residual, np.concatenate([np.zeros(6), guess.ravel()]), xtol=1e-12, ftol=1e-12, gtol=1e-15, max_nfev=_LOOKS
-    )
+    first = np.concatenate([np.zeros(6), guess.ravel()])
+    found = least_squares(residual, first, xtol=1e-12, ftol=1e-12, gtol=1e-15, max_nfev=_LOOKS)
     return pose_of(found.x), found.x[6:].reshape(-1, 3)
 
 
@@ -174,4 +155,4 @@ def _align_points(points: Floats, where: Floats) -> Floats:
     left, _, right = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
     sign = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(right.T @ left.T)))])
     turn = right.T @ sign @ left.T
-    return np.concatenate([b.mean(axis=0) - turn @ a.mean(axis=0), quat_from_matrix(turn)])
+    return np.concatenate([b.mean(axis=0) - turn @ a.mean(axis=0), transforms.quat_from_matrix(turn)])

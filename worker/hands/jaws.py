@@ -53,24 +53,16 @@ _IN_SPACE: Final = 0.2
 class Jaws:
     """Closing motion of a gripper: K postures from open to contact of the pads, or to the limits."""
 
-    q: Floats
-    """(K, D) dof values."""
-    width: Floats
-    """(K,) clear width between the pads [m]."""
-    middle: Floats
-    """(K, 3) point between the pads, root frame [m]."""
-    axis: Floats
-    """(K, 3) unit vector from the first pad to the second, root frame."""
-    speed: Floats
-    """(K, D, 2) motion of each pad towards the other per dof [m/rad or 1]."""
+    q: Floats  # (K, D) dof values
+    width: Floats  # (K,) clear width between the pads [m]
+    middle: Floats  # (K, 3) point between the pads, root frame [m]
+    axis: Floats  # (K, 3) unit vector from the first pad to the second, root frame
+    speed: Floats  # (K, D, 2) motion of each pad towards the other per dof [m/rad or 1]
     bodies: tuple[tuple[int, ...], tuple[int, ...]]
-    """Bodies that carry the first and the second pad; 0 is the root, a jaw that does not move."""
-    points: SurfacePoints
-    """Points on both pads."""
-    first: NDArray[np.bool_]
-    """(P,) mask of the points on the first pad."""
-    length: float
-    """Extent of the pads along the approach [m]; 0 if no approach is known."""
+    """Bodies with the first and with the second pad; 0 is the root, a jaw that does not move."""
+    points: SurfacePoints  # points on both pads
+    first: NDArray[np.bool_]  # (P,) mask of the points on the first pad
+    length: float  # extent of the pads along the approach [m]; 0 if no approach is known
 
     @cached_property
     def opening(self) -> float:
@@ -93,15 +85,17 @@ class Jaws:
 
 def closing_by_geometry(hand: HandModel) -> Floats:
     """Return each dof's direction (D,) that brings opposing surfaces together: +1, -1, or 0 for none.
-    The sign is opposite to that of a sum over postures, from all dofs at their lower limits to all at their upper
-    limits. Each summand is the area of facing surfaces times the speed at which they separate."""
+    The sign is opposite to that of a sum over postures from the lower to the upper limits. Each summand is the area of
+    facing surfaces times the speed at which they separate."""
     points = _points(hand)
     balance, total = np.zeros(hand.dofs), np.zeros(hand.dofs)
     for share in np.linspace(0.05, 0.95, 5):
         q = hand.lower + share * hand.span
         place, normal = posed_points(hand, points, q)
         motions = [_motion(hand, points, q, dof) for dof in range(hand.dofs)]
-        moved = np.max([_normal_speed(motion, normal) for motion in motions], axis=0) > _LEADING
+        # Absolute speed along the normal, relative to the fastest point's speed.
+        speeds = [np.abs(np.einsum("ni,ni->n", m, normal)) / np.abs(m).max(initial=1e-12) for m in motions]
+        moved = np.max(speeds, axis=0) > _LEADING
         first, second, _ = _facing(place, normal, points, np.flatnonzero(moved))
         for dof, motion in enumerate(motions):
             rate = np.einsum("ni,ni->n", motion[second] - motion[first], normal[first])
@@ -128,13 +122,11 @@ def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
     path = closing_posture(hand, np.linspace(0.0, 1.0, _STEPS)[:, None])
     if _is_centric(hand, points, path):
         return None
-    met = _closed_posture(hand, points, path)
-    if met is None:
+    if (met := _closed_posture(hand, points, path)) is None:
         return None
     closed, first, second, faced = met
     place, normal = posed_points(hand, points, closed)
-    sides = _pad_points(place, normal, points, np.unique(np.concatenate([first, second])), faced)
-    if sides is None:
+    if (sides := _pad_points(place, normal, points, np.union1d(first, second), faced)) is None:
         return None
     share = float(np.max(np.abs(closed - path[0]) / np.maximum(np.abs(path[-1] - path[0]), 1e-12)))
     return _measure_jaws(hand, points, sides, closing_posture(hand, np.linspace(0.0, share, _STEPS)[:, None]), approach)
@@ -154,14 +146,8 @@ def posed_points(hand: HandModel, points: SurfacePoints, q: Floats) -> tuple[Flo
 
 def _motion(hand: HandModel, points: SurfacePoints, q: Floats, dof: int) -> Floats:
     """Return the derivative (N, 3) of the points by a dof [m/rad or 1]."""
-    step = np.zeros(hand.dofs)
-    step[dof] = 1e-4 * max(float(hand.span[dof]), 1e-3)
+    step = np.eye(hand.dofs)[dof] * (1e-4 * max(float(hand.span[dof]), 1e-3))
     return (posed_points(hand, points, q + step)[0] - posed_points(hand, points, q - step)[0]) / (2 * step[dof])
-
-
-def _normal_speed(motion: Floats, normal: Floats) -> Floats:
-    """Return the points' absolute speed (N,) along their normals, relative to the fastest point's speed."""
-    return np.asarray(np.abs(np.einsum("ni,ni->n", motion, normal)) / np.abs(motion).max(initial=1e-12))
 
 
 def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -> tuple[Ints, Ints, Floats]:
@@ -231,7 +217,7 @@ def _pad_points(
     line = vectors[:, int(np.argmax(values))]
     line = -sign_of(line) * line
     along = normal[every] @ line
-    one, two = (_on_pads(side, points, faced) for side in (every[along > _FACING_COS], every[along < -_FACING_COS]))
+    one, two = (_on_pads(every[side > _FACING_COS], points, faced) for side in (along, -along))
     if not len(one) or not len(two) or set(points.body[one]) & set(points.body[two]):
         return None
     # The first pad faces the second: it has the lower coordinate along the line.
@@ -270,13 +256,13 @@ def _measure_jaws(
         for dof in range(hand.dofs):
             motion = _motion(hand, points, q, dof)
             speed[k, dof] = (motion[one] @ axis).mean(), -(motion[two] @ axis).mean()
-    both = np.concatenate([one, two])
     if not facing[-1]:
         return None
-    kept = slice(int(np.flatnonzero(~facing)[-1]) + 1 if not facing.all() else 0, None)
+    both = np.concatenate([one, two])
+    kept = slice(int(np.flatnonzero(~facing).max(initial=-1)) + 1, None)
     place, _ = posed_points(hand, points, path[kept][len(path[kept]) // 2])
     along = place[both] @ (approach if approach is not None else np.zeros(3))
-    bodies = tuple(tuple(sorted(set(points.body[side].tolist()))) for side in sides)
+    bodies = [tuple(np.unique(points.body[side]).tolist()) for side in sides]
     return Jaws(
         path[kept],
         np.maximum(width, 0.0)[kept],
@@ -301,7 +287,6 @@ PAD: Final = 0.5
 _AHEAD: Final = 0.7
 #: Number of directions in which a fingertip is measured.
 _DIRECTIONS: Final = 256
-
 #: Number of surface points for the pads.
 _PAD_POINTS: Final = 1000
 
@@ -311,12 +296,9 @@ class Pad:
     """Part of a body's surface that presses on objects, in the body's frame."""
 
     body: int
-    centre: Floats
-    """(3,) [m]"""
-    normal: Floats
-    """(3,) unit: pressing direction."""
-    points: Floats
-    """(P, 3) surface points [m]; empty if the body has no shape."""
+    centre: Floats  # (3,) [m]
+    normal: Floats  # (3,) unit: pressing direction
+    points: Floats  # (P, 3) surface points [m]; empty if the body has no shape
 
 
 def pads_of(hand: HandModel) -> tuple[Pad, ...]:
@@ -367,11 +349,10 @@ def thinnest_fingertip(hand: HandModel) -> float:
 def _leading_points(hand: HandModel, tip: int, driven: int, place: Floats, normal: Floats) -> NDArray[np.bool_]:
     """Return a mask (P,) of the fastest points of a tip that a body's joint moves along their normals."""
     dof = int(hand.dof[driven])
-    step = np.zeros(hand.dofs)
-    step[dof] = 1e-4 * (hand.closing[dof] or 1.0)
+    step = np.eye(hand.dofs)[dof] * (1e-4 * (hand.closing[dof] or 1.0))
     q = np.stack([hand.preshape, hand.preshape + step])
     pose = body_poses(hand, np.tile(IDENTITY_POSE, (2, 1)), hand.expand(q))[:, tip]
-    moved = quat_rotate(pose[:, None, 3:], place[None]) + pose[:, None, :3]
+    moved = apply(pose[:, None], place)
     move = quat_rotate(quat_conjugate(pose[0, 3:]), moved[1] - moved[0])
     speed = np.linalg.norm(move, axis=1)
     ahead = np.einsum("ij,ij->i", move / np.maximum(speed, 1e-12)[:, None], normal) > _AHEAD

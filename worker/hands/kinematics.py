@@ -12,9 +12,8 @@ from graspd.worker.hands.model import HandModel, JointType
 
 
 def body_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats) -> Floats:
-    """Compute the poses (N, L, 7) of all bodies' frames in the world frame, here the object's.
-    `hand_pose` (N, 7) is the pose of the root link in the world frame. `joint_positions` (N, J) are in the order of
-    `HandModel.joint_names` [rad or m]."""
+    """Compute the poses (N, L, 7) of all bodies in the frame of `hand_pose` (N, 7), the root link's poses.
+    `joint_positions` (N, J) [rad or m] are in the order of `HandModel.joint_names`."""
     hand_pose = np.atleast_2d(np.asarray(hand_pose, float))
     joints = np.atleast_2d(np.asarray(joint_positions, float))
     poses = np.empty((len(hand_pose), hand.bodies, 7))
@@ -63,7 +62,5 @@ def generalized_forces(
     motion = np.where(ancestors(hand)[body][..., None], motion, 0.0)
     joint = np.asarray(forces, float) @ np.swapaxes(motion, -1, -2)
     drive = np.zeros((hand.bodies, hand.dofs))
-    moving = np.arange(1, hand.bodies)
-    drive[moving, hand.dof[moving]] = hand.multiplier[moving]
-    torque: Floats = joint @ drive
-    return torque
+    drive[np.arange(1, hand.bodies), hand.dof[1:]] = hand.multiplier[1:]
+    return np.asarray(joint @ drive)

@@ -50,9 +50,8 @@ def load_hand(
     files: Mapping[str, bytes], *, name: str, digest: str, options: Mapping[str, Any] | None = None, drag: bool = False
 ) -> HandModel:
     """Load a hand from URDF or MJCF, meshes, and optional `asset.json` or `hand.json` (`parse_options`).
-    `digest` is that of the files; `options` are keys that override those in the files. With `drag`, its joints have the
-    armature and dry friction in the files.
-    Raises HandError: the files describe no usable hand; the message names the fault and the fix."""
+    `digest` is that of the files; `options` override keys in the files. With `drag`, joints have the files' armature
+    and dry friction. Raises HandError: the files describe no usable hand; the message names the fault and the fix."""
     source = HandSource.read(files, options, name=name, digest=digest)
     with caching_steps("hand_shapes", (digest_files(AssetKind.HAND, files),), (collisions, guess, primitives, shapes)):
         hand = assemble(source)
@@ -119,12 +118,11 @@ def _drag(robot: Robot, hand: HandModel) -> Drag:
 def body_model(source: HandSource, tree: Tree) -> HandModel:
     """Build bodies, joints and pieces of a tree, without palm, fingers, closing and neighbours.
     Raises HandError: no part can touch, or a mesh or a number cannot be used."""
-    robot = source.robot
+    robot, root = source.robot, tree.bodies[0].name
     base = str(PurePosixPath(source.main).parent).removeprefix(".")
-    pieces = _pieces(source, tree, base)
-    if not pieces:
+    if not (pieces := _pieces(source, tree, base)):
         raise HandError.with_fixes(
-            f"no link of the hand, from {tree.bodies[0].name!r} on, has collision geometry, so nothing can touch",
+            f"no link of the hand, from {root!r} on, has collision geometry, so nothing can touch",
             "add <collision> elements, or begin elsewhere: --root LINK",
             {"root": None},
         )
@@ -140,7 +138,7 @@ def body_model(source: HandSource, tree: Tree) -> HandModel:
     return HandModel(
         name=source.name,
         digest=source.digest,
-        root_link=tree.bodies[0].name,
+        root_link=root,
         body_names=tuple(body.name for body in tree.bodies),
         parent=np.array([body.parent for body in tree.bodies], dtype=np.int32),
         joint_type=np.array([_joint_type(joint) for joint in joints], dtype=np.int32),
@@ -164,7 +162,7 @@ def body_model(source: HandSource, tree: Tree) -> HandModel:
         neighbours=frozenset(),
         masses=_masses(robot, tree, pieces),
         velocity=tree.velocity,
-        arm=chain_to(robot, tree.bodies[0].name),
+        arm=chain_to(robot, root),
         visuals=Visuals(visuals, source.files, base),
         frames=dict(tree.links),
         tendons=tendons_of(robot, source.options.tendons, tree.dof_names),
@@ -201,9 +199,8 @@ def _joint_type(joint: Joint | None) -> JointType:
 def assumed_efforts(source: HandSource, dofs: Sequence[str]) -> list[str]:
     """Return the dofs whose torque or force limit neither the robot nor the options state."""
     stated = source.options.effort
-    if isinstance(stated, float):
-        return []
-    return [dof for dof in dofs if dof not in (stated or {}) and source.robot.joints[dof].effort <= 0]
+    known = dofs if isinstance(stated, float) else stated or {}
+    return [dof for dof in dofs if dof not in known and source.robot.joints[dof].effort <= 0]
 
 
 def _effort(source: HandSource, tree: Tree) -> Floats:
@@ -250,13 +247,8 @@ def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None, *
     """Load a hand for the command line: a built-in's name, URDF, folder, or ZIP; `drag`: see `load_hand`.
     Raises NotFoundError: neither a file nor a built-in hand. HandError: see `load_hand`."""
     name, files, stated = files_from_path(path)
-    return load_hand(
-        files,
-        name=name,
-        digest=digest_variant(digest_files(AssetKind.HAND, files), options),
-        options={**stated, **(options or {})},
-        drag=drag,
-    )
+    digest = digest_variant(digest_files(AssetKind.HAND, files), options)
+    return load_hand(files, name=name, digest=digest, options={**stated, **(options or {})}, drag=drag)
 
 
 def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, Any]]:
@@ -278,7 +270,7 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
 def with_default_drives(hand: HandModel, stated: Collection[str], assumed: Sequence[str]) -> HandModel:
     """Replace the defaults of revolute joints by those of sliding joints and jaws, unless stated.
     A dof that moves pads by v [m/rad or 1] along their line gets the limit f |v| and the gain k v^2, summed over the
-    pads. Each pad thus has the gain k [N/m] and the limit f [N], independent of the gearing."""
+    pads. Each pad thus has gain k [N/m] and limit f [N] for any gearing."""
     slide, jaws = prismatic_dofs(hand), jaws_of(hand)
     if jaws is None and not slide.any():
         return hand

@@ -21,11 +21,9 @@ from graspd.worker.hands.primitives import hull
 from graspd.worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, build_robot
 from graspd.worker.hands.tree import joint_motion
 
-_FREE, _HINGE, _SLIDE = (
-    int(kind) for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-)
-#: Colour of a geom without a stated colour; such a geom has its material's colour.
-_NAMED_COLOUR: Final = np.array([0.5, 0.5, 0.5, 1.0])
+_FREE, _HINGE, _SLIDE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "HINGE", "SLIDE"))
+#: Colour that MuJoCo gives to a geom without a stated colour; such a geom has its material's colour.
+_UNSTATED_COLOUR: Final = np.array([0.5, 0.5, 0.5, 1.0])
 #: First group that MuJoCo's viewer does not draw.
 _HIDDEN_GROUP: Final = 3
 #: Distance below which a joint's anchor is at its body's origin [m].
@@ -34,8 +32,7 @@ _AT_ORIGIN_M: Final = 1e-12
 
 def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
     """Read and check an MJCF model.
-    Raises HandError: MuJoCo rejects it, or it is no hand; the message names the fault. LimitError: larger than a
-    hand."""
+    Raises HandError: MuJoCo rejects the model, or it is no hand. LimitError: the model is larger than a hand."""
     text, assets, notes = inline_model(files, main)
     try:
         model = mujoco.MjModel.from_xml_string(text, assets)
@@ -54,6 +51,8 @@ def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
 
 
 class _Reader:
+    """Converts a compiled model's bodies to links and joints."""
+
     def __init__(self, model: Any, main: str, notes: list[str]) -> None:
         self.model, self.main = model, main
         self.links: list[Link] = []
@@ -72,20 +71,13 @@ class _Reader:
     def roots(self) -> list[int]:
         """Return the world's children with moving joints; its other children belong to the environment."""
         model = self.model
-        moving = {
-            chain_up(model, int(model.jnt_bodyid[j]))[-1]
-            for j in range(model.njnt)
-            if int(model.jnt_type[j]) in (_HINGE, _SLIDE)
-        }
-        found = sorted(moving)
-        if not found:
+        joints = [(int(model.jnt_type[j]), int(model.jnt_bodyid[j])) for j in range(model.njnt)]
+        moving = {chain_up(model, body)[-1] for kind, body in joints if kind in (_HINGE, _SLIDE)}
+        if not moving:
             raise HandError(f"{self.main}: no moving joint; a hand needs at least one hinge or slide joint")
-        free = [j for j in range(model.njnt) if int(model.jnt_type[j]) == _FREE and int(model.jnt_bodyid[j]) in moving]
-        self.notes += [
-            f"{self.body_name(int(model.jnt_bodyid[j]))!r} has a free joint, which is replaced by a fixed one"
-            for j in free
-        ]
-        return found
+        free = [self.body_name(body) for kind, body in joints if kind == _FREE and body in moving]
+        self.notes += [f"{name!r} has a free joint, which is replaced by a fixed one" for name in free]
+        return sorted(moving)
 
     def joints_of(self, body: int) -> list[int]:
         first, count = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
@@ -124,15 +116,12 @@ class _Reader:
     def _joint(self, joint: int, parent: str, child: str, origin: Floats) -> Joint:
         model, name = self.model, self.joint_name(joint)
         what = f"{self.main}: joint {name!r}"
-        kind = int(model.jnt_type[joint])
         still = Joint(name, "fixed", parent, child, origin)
-        if kind not in (_HINGE, _SLIDE):
-            fault = f"{what} is a ball joint; write it as three hinge joints"
-            return replace(still, type="ball", fault=fault)
-        slides = kind == _SLIDE
-        moving = replace(
-            still, type="prismatic" if slides else "revolute", axis=np.asarray(model.jnt_axis[joint], float)
-        )
+        if int(model.jnt_type[joint]) not in (_HINGE, _SLIDE):
+            return replace(still, type="ball", fault=f"{what} is a ball joint; write it as three hinge joints")
+        slides = int(model.jnt_type[joint]) == _SLIDE
+        axis = np.asarray(model.jnt_axis[joint], float)
+        moving = replace(still, type="prismatic" if slides else "revolute", axis=axis)
         # In the pose of the file, the joint has the value `ref`.
         origin = compose(origin, joint_motion(moving, -float(model.qpos0[model.jnt_qposadr[joint]])))
         follows = self._mimics.get(joint)
@@ -202,7 +191,7 @@ class _Reader:
 
     def _colour(self, geom: int) -> tuple[float, float, float] | None:
         rgba, material = self.model.geom_rgba[geom], int(self.model.geom_matid[geom])
-        if material >= 0 and np.allclose(rgba, _NAMED_COLOUR):
+        if material >= 0 and np.allclose(rgba, _UNSTATED_COLOUR):
             rgba = self.model.mat_rgba[material]
         return (float(rgba[0]), float(rgba[1]), float(rgba[2])) if rgba[3] > 0 else None
 

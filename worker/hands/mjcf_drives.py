@@ -50,8 +50,7 @@ class Couplings:
 
     def _add_equality(self, equality: int) -> None:
         first, second = int(self.model.eq_obj1id[equality]), int(self.model.eq_obj2id[equality])
-        polynomial = np.asarray(self.model.eq_data[equality, :5])
-        kind = int(self.model.eq_type[equality])
+        polynomial, kind = np.asarray(self.model.eq_data[equality, :5]), int(self.model.eq_type[equality])
         if kind == int(mujoco.mjtEq.mjEQ_JOINT):
             self._couple(first, second, polynomial)
         if kind != int(mujoco.mjtEq.mjEQ_TENDON):
@@ -102,8 +101,7 @@ class Couplings:
 
     def _couple_on_tendon(self, length: float, pulled: list[tuple[int, float]]) -> None:
         """Couple two joints on a fixed tendon: c1 (q1 - q1_0) + c2 (q2 - q2_0) = length.
-        The joint without actuator follows. Limits take precedence over the tendon: a follower at its limit does not
-        move, as in a finger with a compliant end."""
+        The joint without actuator follows; at its limit it stops, as in a finger with a compliant end."""
         free = [pair for pair in pulled if pair[0] not in self.follows and pair[0] not in self._actuated]
         if not free or abs(free[-1][1]) < 1e-9:
             self.notes.append(f"a tendon of {' and '.join(self.name(joint) for joint, _ in pulled)} was left out")
@@ -115,8 +113,8 @@ class Couplings:
         values = np.clip(line, *self._range(joint))
         if np.ptp(values) < 1e-6:
             self.follows[joint] = float(values[0])
-            stays = f"stays at {values[0]:.3g}: its limits prevent the motion that its tendon requires"
-            self.notes.append(f"{self.name(joint)!r} {stays}")
+            reason = "its limits prevent the motion that its tendon requires"
+            self.notes.append(f"{self.name(joint)!r} stays at {values[0]:.3g}: {reason}")
             return
         slope, constant, error = _fit_line(at, values)
         self.follows[joint] = Mimic(self.name(driver), slope, constant)
@@ -126,7 +124,7 @@ class Couplings:
     def _add_tendons(self) -> None:
         """Couple joints that share one actuated tendon and have no other drive.
         Serial joints of one finger share the tendon according to contact. Parallel joints (jaws of a gripper) move in
-        proportion to their coefficients. If jaws shared the tendon freely, the object could move from side to side."""
+        proportion to their coefficients; otherwise the object could move from side to side."""
         alone = {pulled[0][0] for pulled in self._driven if len(pulled) == 1}
         for actuator, pulled in enumerate(self._driven):
             free = [(j, c) for j, c in pulled if j not in self.follows and j not in alone and abs(c) > 1e-9]
@@ -147,9 +145,7 @@ class Couplings:
         return all(a <= b for a, b in itertools.pairwise(chains))
 
     def _range(self, joint: int) -> tuple[float, float]:
-        if not self.model.jnt_limited[joint]:
-            return -np.pi, np.pi
-        lower, upper = self.model.jnt_range[joint]
+        lower, upper = self.model.jnt_range[joint] if self.model.jnt_limited[joint] else (-np.pi, np.pi)
         return float(lower), float(upper)
 
     def _rest(self, joint: int) -> float:
@@ -173,9 +169,9 @@ class Couplings:
         Raises HandError: a joint is no hinge or slide, the group has no single driver, it does not close over the
         driver's range, or a joint depends on the driver nonlinearly."""
         held = ", ".join(map(self.name, joints))
-        if round_ones := [j for j in joints if int(self.model.jnt_type[j]) not in _ONE_VALUE]:
+        if balls := [j for j in joints if int(self.model.jnt_type[j]) not in _ONE_VALUE]:
             raise HandError(
-                f"the loop of {held} cannot be solved: {self.name(round_ones[0])} is no hinge or slide joint; "
+                f"the loop of {held} cannot be solved: {self.name(balls[0])} is no hinge or slide joint; "
                 "write equalities of joints instead of the loop"
             )
         drivers = [j for j in joints if j in self._actuated and j not in self.follows]
@@ -191,18 +187,16 @@ class Couplings:
             )
         driver = self.name(drivers[0])
         values, followers = self._solve(group, drivers[0], passive)
-        worst = 0.0
-        lines: dict[int, Mimic | float] = {}
-        for joint, follower in zip(passive, followers.T, strict=True):
-            slope, constant, error = _fit_line(values, follower)
+        lines = [_fit_line(values, follower) for follower in followers.T]
+        for joint, (_, _, error) in zip(passive, lines, strict=True):
             if error > MAX_ERROR_RAD:
                 raise HandError(
                     f"the loop of {driver!r} moves {self.name(joint)!r} nonlinearly (error {error:.2f}); "
                     "write an equality of the two joints instead"
                 )
-            worst = max(worst, error)
-            lines[joint] = Mimic(driver, slope, constant)
-        self.follows |= lines
+        mimics = [Mimic(driver, slope, constant) for slope, constant, _ in lines]
+        self.follows |= dict(zip(passive, mimics, strict=True))
+        worst = max(error for _, _, error in lines)
         self.notes.append(f"{', '.join(map(self.name, passive))} follow {driver} within {worst:.2g} rad")
 
     def _solve(self, loops: list[int], driver: int, passive: list[int]) -> tuple[Floats, Floats]:
@@ -221,10 +215,8 @@ class Couplings:
             guess = solved[behind] if known else rest
             solved[step], gap = _close_loops(self.model, data, loops, driver, values[step], passive, guess)
             if gap > _OPEN_M:
-                raise HandError(
-                    f"the loop of {self.name(driver)!r} is open by {1e3 * gap:.1f} mm at {values[step]:.2f}; correct "
-                    "its range"
-                )
+                opening = f"open by {1e3 * gap:.1f} mm at {values[step]:.2f}"
+                raise HandError(f"the loop of {self.name(driver)!r} is {opening}; correct its range")
         return values, solved
 
 
@@ -278,8 +270,7 @@ def _close_loops(
 ) -> tuple[Floats, float]:
     """Solve for passive joint values at a driver value (Gauss-Newton); also return the loops' gap [m]."""
     address, dofs = [int(model.jnt_qposadr[j]) for j in passive], [int(model.jnt_dofadr[j]) for j in passive]
-    q = guess.copy()
-    gap = np.inf
+    q, gap = guess.copy(), np.inf
     jacobians = np.zeros((2, 3, model.nv))
     for _ in range(_ROUNDS):
         data.qpos[:] = model.qpos0
@@ -318,9 +309,9 @@ def servo_parameters(
 ) -> dict[int, tuple[float, float]]:
     """Return effort [N m or N] and stiffness [N m/rad or N/m] of each driven joint; 0 if not stated.
     An actuator of gear g on a length l pulls joint q with g F dl/dq. A position servo of gain k gives the joint the
-    stiffness k (g dl/dq)^2. If the actuator drives the joint itself, dl/dq is 1. On a fixed tendon, it is the joint's
-    coefficient plus coefficient times rate of each follower. If n joints share a tendon (`shared`), each gets n times
-    the tendon's gain, so that their series has the tendon's gain."""
+    stiffness k (g dl/dq)^2. The rate dl/dq is 1 for a driven joint; on a fixed tendon, it is the joint's coefficient
+    plus coefficient times rate of each follower. Each of n joints that share a tendon (`shared`) gets n times the
+    tendon's gain, so that their series has the tendon's gain."""
     found: dict[int, tuple[float, float]] = {}
     joint_of = {str(model.joint(j).name): j for j in range(model.njnt)}
     for actuator in range(model.nu):
@@ -350,8 +341,8 @@ def commanded_ranges(model: Any) -> dict[int, tuple[float, float]]:
         gear = float(model.actuator_gear[actuator, 0])
         if kind != int(mujoco.mjtTrn.mjTRN_JOINT) or gain <= 0 or not gear or not model.actuator_ctrllimited[actuator]:
             continue
-        told = float(model.actuator_gainprm[actuator, 0]) * np.asarray(model.actuator_ctrlrange[actuator], float)
-        ends = (told + float(model.actuator_biasprm[actuator, 0])) / (gain * gear)
+        force = float(model.actuator_gainprm[actuator, 0]) * np.asarray(model.actuator_ctrlrange[actuator], float)
+        ends = (force + float(model.actuator_biasprm[actuator, 0])) / (gain * gear)
         if np.ptp(ends) > 1e-6:
             found[int(model.actuator_trnid[actuator, 0])] = float(ends.min()), float(ends.max())
     return found
@@ -366,12 +357,10 @@ def driven_joints(model: Any, actuator: int) -> list[tuple[int, float]]:
 
 
 def joints_on_tendon(model: Any, tendon: int) -> list[tuple[int, float]]:
-    first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
-    return [
-        (int(model.wrap_objid[w]), float(model.wrap_prm[w]))
-        for w in range(first, first + count)
-        if model.wrap_type[w] == int(mujoco.mjtWrap.mjWRAP_JOINT)
-    ]
+    """Return the joints on a fixed tendon, each with its coefficient."""
+    first, kind = int(model.tendon_adr[tendon]), int(mujoco.mjtWrap.mjWRAP_JOINT)
+    wraps = [w for w in range(first, first + int(model.tendon_num[tendon])) if model.wrap_type[w] == kind]
+    return [(int(model.wrap_objid[w]), float(model.wrap_prm[w])) for w in wraps]
 
 
 def _driver(joint: int, mimics: Mapping[int, Mimic | float], joint_of: Mapping[str, int]) -> tuple[int | None, float]:

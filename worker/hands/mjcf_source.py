@@ -50,8 +50,8 @@ def inline_model(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, 
     for element in list(root.iter()):
         if element.tag in _REFUSED:
             raise HandError(f"{main}: <{element.tag}> is not read; write its parts out, or give the hand's own file")
-        if element.tag == "mesh" and (file := element.get("file")):
-            _add_mesh(element, file, files, main, folder, assets)
+        if element.tag == "mesh" and element.get("file"):
+            _add_mesh(element, files, main, folder, assets)
             continue
         for name in _DROPPED & element.attrib.keys():
             del element.attrib[name]
@@ -69,9 +69,7 @@ def inline_model(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, 
     compiler.set("boundinertia", compiler.get("boundinertia", "1e-12"))
     if _uses_radians(root):
         compiler.set("angle", "radian")
-        notes.append(
-            'angles read as radians, since they are too small for degrees (if not: <compiler angle="degree"/>)'
-        )
+        notes.append('angles read as radians: too small for degrees (if not: <compiler angle="degree"/>)')
     return ElementTree.tostring(root, encoding="unicode"), assets, notes
 
 
@@ -87,12 +85,12 @@ def _ignored_elements(root: Element) -> list[str]:
         if (one.tag == "weld" and len(one.attrib.keys() & {"body1", "body2", "site1", "site2"}) == 2)
         or {one.get("tendon1"), one.get("tendon2")} & spatial - {None}
     ]
-    told = (
+    notes = (
         (pulled, "on spatial tendons, which are ignored: joints are planned as if each had its own drive"),
         (others, "ignored: only motors and servos of joints and fixed tendons are read"),
         (held, "ignored: the bodies or tendons that it connects are planned as free"),
     )
-    return [f"{_element_names(elements)} {note}" for elements, note in told if elements]
+    return [f"{_element_names(elements)} {note}" for elements, note in notes if elements]
 
 
 def _element_names(elements: list[Element]) -> str:
@@ -109,13 +107,10 @@ def _uses_radians(root: Element) -> bool:
     This is assumed if no joint limit and no other angle exceeds 2 pi."""
     if any("angle" in compiler.attrib for compiler in root.findall("compiler")):
         return False
-    hinges = [e for e in root.iter("joint") if "range" in e.attrib and e.get("type", "hinge") != "slide"]
+    hinges = [joint for joint in root.iter("joint") if joint.get("type", "hinge") != "slide"]
     ranges = [value for hinge in hinges for value in _parse_floats(hinge.get("range", ""))]
-    turns = [
-        value
-        for e in root.iter()
-        for value in _parse_floats(e.get("euler", "")) + _parse_floats(e.get("axisangle", ""))[3:]
-    ]
+    turns = [value for element in root.iter() for value in _parse_floats(element.get("euler", ""))]
+    turns += [value for element in root.iter() for value in _parse_floats(element.get("axisangle", ""))[3:]]
     return bool(ranges) and max(map(abs, ranges + turns)) <= 2 * math.pi
 
 
@@ -169,6 +164,7 @@ def _find(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str
 
 
 def _mesh_folder(root: Element) -> tuple[str, bool]:
+    """Return the folder of mesh files, and whether the folders in their names are ignored."""
     folder, strip = "", False
     for compiler in root.findall("compiler"):
         folder = compiler.get("meshdir", compiler.get("assetdir", folder))
@@ -177,22 +173,17 @@ def _mesh_folder(root: Element) -> tuple[str, bool]:
 
 
 def _add_mesh(
-    element: Element,
-    file: str,
-    files: Mapping[str, bytes],
-    main: str,
-    where: tuple[str, bool],
-    assets: dict[str, bytes],
+    element: Element, files: Mapping[str, bytes], main: str, where: tuple[str, bool], assets: dict[str, bytes]
 ) -> None:
-    folder, strip = where
-    wanted = PurePosixPath(file.replace("\\", "/")).name if strip else file
-    base = posixpath.dirname(main)
-    name = _find(posixpath.join(folder, wanted), files, [base, ""], main, "names the mesh")
+    """Rename a mesh's file to a number, and add the file to `assets`; `where`: see `_mesh_folder`."""
+    (folder, strip), file = where, PurePosixPath(element.attrib["file"].replace("\\", "/"))
+    wanted = file.name if strip else element.attrib["file"]
+    name = _find(posixpath.join(folder, wanted), files, [posixpath.dirname(main), ""], main, "names the mesh")
     suffix = PurePosixPath(name).suffix.lower()
     if suffix not in _MESHES:
         raise HandError(f"{main}: the mesh {name!r} is no file of type {', '.join(_MESHES)}; convert it")
     # MuJoCo names a mesh after its file if the model does not name it.
-    element.set("name", element.get("name", PurePosixPath(file.replace("\\", "/")).stem))
+    element.set("name", element.get("name", file.stem))
     check_format(name, files[name], HandError)
     given = f"{len(assets)}{suffix}"
     assets[given] = files[name]
@@ -202,8 +193,7 @@ def _add_mesh(
 
 def _prune(element: Element) -> None:
     for child in list(element):
-        kind = child.get("type", "")
-        if child.tag in _LEFT_OUT or (child.tag == "geom" and kind in ("hfield", "sdf")):
+        if child.tag in _LEFT_OUT or (child.tag == "geom" and child.get("type") in ("hfield", "sdf")):
             element.remove(child)
         else:
             _prune(child)

@@ -37,38 +37,28 @@ class ConvexPiece:
     kind: str  # box, sphere, cylinder, capsule or hull
     size: tuple[float, ...]
     """Box: full extents. Sphere: radius. Cylinder, capsule: radius, length along z without caps. Hull: ()."""
-    pose: Floats
-    """(7,) pose of the primitive's frame in the body frame; identity for hulls."""
-    vertices: Floats
-    """(V, 3) corners of the solid in the body frame [m]; round kinds have a fine tessellation."""
-    faces: Ints
-    """(F, 3) outward triangles."""
-    link: str
-    """Link to which the piece belongs."""
+    pose: Floats  # (7,) pose of the primitive's frame in the body frame; identity for hulls
+    vertices: Floats  # (V, 3) corners of the solid in the body frame [m]; round kinds have a fine tessellation
+    faces: Ints  # (F, 3) outward triangles
+    link: str  # link to which the piece belongs
 
 
 @dataclass(frozen=True)
 class PalmFrame:
     """Point on the palm's surface and the direction in which the hand approaches."""
 
-    centre: Floats
-    """(3,) point on the palm surface in the root frame [m]."""
-    approach: Floats
-    """(3,) unit vector out of the palm, root frame."""
+    centre: Floats  # (3,) point on the palm surface in the root frame [m]
+    approach: Floats  # (3,) unit vector out of the palm, root frame
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
     """Fixed sample of the hand's surface, N points; parts inside another piece have no points."""
 
-    body: Ints
-    """(N,) body of each point."""
-    position: Floats
-    """(N, 3) in the body frame [m]."""
-    normal: Floats
-    """(N, 3) unit, outward, body frame."""
-    area: Floats
-    """(N,) surface area that the point represents [m^2]."""
+    body: Ints  # (N,) body of each point
+    position: Floats  # (N, 3) in the body frame [m]
+    normal: Floats  # (N, 3) unit, outward, body frame
+    area: Floats  # (N,) surface area that the point represents [m^2]
 
     def __len__(self) -> int:
         return len(self.body)
@@ -78,10 +68,8 @@ class SurfacePoints:
 class Drag:
     """Inertia and dry friction of each joint's mechanism, by the joint's body; 0 if not stated."""
 
-    armature: Floats
-    """(L,) inertia of the drive [kg m^2 or kg]."""
-    dry_friction: Floats
-    """(L,) [N m or N]"""
+    armature: Floats  # (L,) inertia of the drive [kg m^2 or kg]
+    dry_friction: Floats  # (L,) [N m or N]
 
 
 @dataclass(frozen=True)
@@ -93,48 +81,32 @@ class HandModel:
     digest: str
     root_link: str
     body_names: tuple[str, ...]
-    parent: Ints
-    """(L,) index of the parent body, smaller than the body's own; -1 for the root, which is body 0."""
-    joint_type: Ints
-    """(L,) `JointType` values."""
-    origin: Floats
-    """(L, 7) pose of the joint frame in the parent's body frame."""
-    axis: Floats
-    """(L, 3) unit joint axis in the joint frame."""
-    dof: Ints
-    """(L,) degree of freedom that drives the body's joint; -1 for the root."""
+    parent: Ints  # (L,) index of the parent body, smaller than the body's own; -1 for the root, which is body 0
+    joint_type: Ints  # (L,) `JointType` values
+    origin: Floats  # (L, 7) pose of the joint frame in the parent's body frame
+    axis: Floats  # (L, 3) unit joint axis in the joint frame
+    dof: Ints  # (L,) degree of freedom that drives the body's joint; -1 for the root
     multiplier: Floats
     offset: Floats
     dof_names: tuple[str, ...]
-    lower: Floats
-    """(D,) limits [rad or m], narrowed by binding limits of followers."""
+    lower: Floats  # (D,) limits [rad or m], narrowed by binding limits of followers
     upper: Floats
-    effort: Floats
-    """(D,) torque or force limit [N m or N]; positive."""
-    stiffness: Floats
-    """(D,) position gain of the controller, Kp [N m/rad or N/m]."""
-    preshape: Floats
-    """(D,) posture of the approach."""
-    closing: Floats
-    """(D,) direction in which the dof closes the hand: -1 or +1; 0 if it does not close."""
-    joint_names: tuple[str, ...]
-    """(J,) all moving joints, including followers, in the description's order."""
-    joint_body: Ints
-    """(J,) the body that each joint carries."""
+    effort: Floats  # (D,) torque or force limit [N m or N]; positive
+    stiffness: Floats  # (D,) position gain of the controller, Kp [N m/rad or N/m]
+    preshape: Floats  # (D,) posture of the approach
+    closing: Floats  # (D,) direction in which the dof closes the hand: -1 or +1; 0 if it does not close
+    joint_names: tuple[str, ...]  # (J,) all moving joints, including followers, in the description's order
+    joint_body: Ints  # (J,) the body that each joint carries
     palm: PalmFrame
-    fingertips: tuple[int, ...]
-    """Bodies at the end of each finger."""
+    fingertips: tuple[int, ...]  # bodies at the end of each finger
     pieces: tuple[ConvexPiece, ...]
     neighbours: frozenset[tuple[int, int]]
     """Pairs of bodies (a < b) whose contact is ignored: adjacent, or touching in every posture."""
-    masses: Floats
-    """(L,) mass of each body [kg]: the description's, else from volume at 1000 kg/m^3."""
+    masses: Floats  # (L,) mass of each body [kg]: the description's, else from volume at 1000 kg/m^3
     velocity: Floats = field(default_factory=lambda: np.zeros(0))
     """(D,) speed limit [rad/s or m/s], narrowed by the limits of followers; 0 if not stated."""
-    arm: tuple[Joint, ...] = ()
-    """Moving and fixed joints from the original robot's root to `root_link`, for export."""
-    visuals: Visuals = NO_VISUALS
-    """Visual meshes."""
+    arm: tuple[Joint, ...] = ()  # moving and fixed joints from the original robot's root to `root_link`, for export
+    visuals: Visuals = NO_VISUALS  # visual meshes
     frames: Mapping[str, tuple[int, Floats]] = field(default_factory=dict)
     """Body of each link, and the link's pose (7,) in the body's frame."""
     tendons: tuple[Tendon, ...] = field(default=(), metadata=TOLD_IF_SET)

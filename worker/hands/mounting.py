@@ -1,8 +1,8 @@
 """Mounting of a hand: links above its root whose poses follow from a grasp, except for wrist angles.
 
-The mounting is its own kinematic tree that starts at the hand's root and runs up the robot. It passes fixed joints,
-joints with one value, and at most `MAX_WRIST_JOINTS` wrist joints: revolute, of limited range, near the root. The first
-other joint belongs to an arm, whose poses a grasp does not determine."""
+The mounting is its own kinematic tree from the hand's root up the robot. The tree contains fixed joints, joints with
+one value, and at most `MAX_WRIST_JOINTS` wrist joints: revolute, of limited range, near the root. The first other joint
+belongs to an arm, whose poses a grasp does not determine."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from graspd.worker.hands.options import HandOptions
 from graspd.worker.hands.robot import Joint, Mimic, Robot, chain_to
 from graspd.worker.hands.tree import LEAST_RANGE, Body, Tree, joint_motion
 
-#: Largest number of joints of a wrist, largest range of each [rad], and its largest distance from the root along the
-#: joints [m]. The last joint of an arm usually has a larger range.
+#: Limits of a wrist: number of joints, range of each [rad], and distance from the root along the joints [m]. The last
+#: joint of an arm usually has a larger range.
 MAX_WRIST_JOINTS: Final = 2
 MAX_WRIST_RANGE: Final = math.pi
 MAX_WRIST_M: Final = 0.1
@@ -50,9 +50,9 @@ def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
     if not any(robot.links[link].shapes for link in links):
         return None
     wrist = [body.joint for body in bodies if body.joint is not None]
-    moving = tuple(joint.name for joint in wrist)
     lower, upper, velocity = np.array([(j.lower, j.upper, j.velocity) for j in wrist]).reshape(-1, 3).T
-    drives = {name: Mimic(name, 1.0, 0.0) for name in moving}
+    drives = {joint.name: Mimic(joint.name, 1.0, 0.0) for joint in wrist}
+    moving = tuple(drives)
     return Tree(tuple(bodies), links, drives, moving, moving, lower, upper, velocity, (), frozenset())
 
 

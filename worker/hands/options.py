@@ -18,8 +18,8 @@ Vector = tuple[Finite, Finite, Finite]
 
 #: Default position gain of joints, Kp [N m/rad]: the value of the DexGraspBench protocol.
 DEFAULT_STIFFNESS: Final = 5.0
-#: Default for sliding joints [N/m] and each pad of any gripper: the revolute default at a lever of 5 cm. Stiffer drives
-#: lose their force in the gap of half a millimetre that a grasp leaves, and in soft contacts.
+#: Default for sliding joints and each pad of a gripper [N/m]: the revolute default at a lever of 5 cm. Stiffer drives
+#: lose their force in soft contacts and in gaps of half a millimetre.
 DEFAULT_LINEAR_STIFFNESS: Final = 2_000.0
 #: Default torque limit [N m] if the URDF gives none or 0: FRoGGeR's value for the Allegro hand.
 DEFAULT_EFFORT: Final = 0.7
@@ -63,9 +63,7 @@ class HandOptions(_Options):
     tendons: dict[str, dict[str, Finite]] | None = Field(
         None, description="drives that pull several joints, and the coefficient of each joint; {}: none"
     )
-    shapes: Literal["collision", "visual"] = Field(
-        "collision", description="geometry in contact: collision or visual elements"
-    )
+    shapes: Literal["collision", "visual"] = Field("collision", description="elements that can touch objects")
     palm: Annotated[PalmOptions | None, BeforeValidator(lambda v: {"link": v} if isinstance(v, str) else v)] = None
     approach: Vector | None = Field(None, description="direction out of the palm, palm link frame")
     preshape: dict[str, Finite] = Field(default_factory=dict, description="joint values on the approach")

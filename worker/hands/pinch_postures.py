@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model import transforms
 from graspd.service.model.errors import HandError
-from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
 from graspd.worker.hands import closing, guess, jaws, kinematics, primitives, surface
 from graspd.worker.hands.closing import closing_posture
 from graspd.worker.hands.jaws import Pad, fingertip_pad
@@ -30,8 +30,8 @@ from graspd.worker.objects.memory_cache import cached_by_content
 POSTURES: Final = 160
 CROWD: Final = 25
 CLIMBS: Final = 100
-#: Limits on the line between the pads: least cosine with the pads' normals, largest cosine with the palm's approach,
-#: and least distance in front of the palm [m].
+#: Least cosine of the line between pads with their normals, its largest cosine with the approach, least distance [m]
+#: in front of the palm.
 FACING: Final = 0.75
 SQUARE: Final = 0.7
 AHEAD_M: Final = 0.02
@@ -57,14 +57,10 @@ _CLOSING_M: Final = 0.003
 class Oppositions:
     """K postures in which pads of a hand face one another, sorted by width; root frame."""
 
-    q: Floats
-    """(K, D)"""
-    axis: Floats
-    """(K, 3) unit vector from the opposing finger's pad to the other pads."""
-    middle: Floats
-    """(K, 3) midpoint [m]."""
-    width: Floats
-    """(K,) gap, ascending [m]."""
+    q: Floats  # (K, D)
+    axis: Floats  # (K, 3) unit vector from the opposing finger's pad to the other pads
+    middle: Floats  # (K, 3) midpoint [m]
+    width: Floats  # (K,) gap, ascending [m]
 
     def __len__(self) -> int:
         return len(self.q)
@@ -80,7 +76,7 @@ class Oppositions:
 
     @classmethod
     def of(cls, q: Floats, seen: Any, good: NDArray[np.intp]) -> Oppositions:
-        """Select the evaluated postures `good`, and sort them by width."""
+        """Select the rows `good` of postures and of their evaluation `seen`, sorted by width."""
         good = good[np.argsort(seen.width[good], kind="stable")]
         return cls(q[good], seen.axis[good], seen.middle[good], seen.width[good])
 
@@ -113,20 +109,18 @@ def _oppositions(hand: HandModel) -> Oppositions:
     wanted = np.linspace(THINNEST_M, np.quantile(seen.width, 0.98), POSTURES)
     q = improve_postures(hand, one, q, lambda tried: _PadGaps.of(hand, pads, one, tried).cost(wanted))
     seen = _PadGaps.of(hand, pads, one, q)
-    good = np.flatnonzero(
-        (seen.facing > FACING) & (seen.square < SQUARE) & (seen.width > THINNEST_M) & (seen.ahead > AHEAD_M)
-    )
-    return Oppositions.of(q, seen, good)
+    faces = (seen.facing > FACING) & (seen.square < SQUARE)
+    return Oppositions.of(q, seen, np.flatnonzero(faces & (seen.width > THINNEST_M) & (seen.ahead > AHEAD_M)))
 
 
 def opposed_finger(hand: HandModel) -> int:
     """Return the fingertip that opposes the others best, usually the thumb's."""
     pads = [fingertip_pad(hand, body) for body in hand.fingertips]
-    tried = []
+    costs = []
     for one in range(len(pads)):
         seen = _PadGaps.of(hand, pads, one, random_postures(hand, one, POSTURES))
-        tried.append((float(np.sort(seen.cost(seen.width))[: POSTURES // 4].mean()), one))
-    return min(tried)[1]
+        costs.append(float(np.sort(seen.cost(seen.width))[: POSTURES // 4].mean()))
+    return costs.index(min(costs))
 
 
 @dataclass(frozen=True)
@@ -136,32 +130,24 @@ class _PadGaps:
     axis: Floats
     middle: Floats
     width: Floats
-    facing: Floats
-    """(N,) cosine of the pads' normals with the line between the pads; the lower value of both sides."""
-    square: Floats
-    """(N,) absolute cosine of the palm's approach with the line between the pads."""
-    ahead: Floats
-    """(N,) distance of the line's middle in front of the palm [m]."""
+    facing: Floats  # (N,) cosine of the pads' normals with the line between the pads; the lower value of both sides
+    square: Floats  # (N,) absolute cosine of the palm's approach with the line between the pads
+    ahead: Floats  # (N,) distance of the line's middle in front of the palm [m]
 
     @classmethod
     def of(cls, hand: HandModel, pads: list[Pad], one: int, q: Floats) -> _PadGaps:
         tips = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))[:, list(hand.fingertips)]
-        place = quat_rotate(tips[..., 3:], np.array([p.centre for p in pads])) + tips[..., :3]
+        place = apply(tips, np.array([p.centre for p in pads]))
         looks = quat_rotate(tips[..., 3:], np.array([p.normal for p in pads]))
         others = [f for f in range(len(pads)) if f != one]
         a, b = place[:, one], place[:, others].mean(axis=1)
         width = np.linalg.norm(b - a, axis=1)
         axis = (b - a) / np.maximum(width, 1e-9)[:, None]
         towards = -np.einsum("nfi,ni->nf", looks[:, others], axis).mean(axis=1)
-        middle, ahead = 0.5 * (a + b), hand.palm.approach
-        return cls(
-            axis=axis,
-            middle=middle,
-            width=width,
-            facing=np.minimum(np.einsum("ni,ni->n", looks[:, one], axis), towards),
-            square=np.abs(axis @ ahead),
-            ahead=(middle - hand.palm.centre) @ ahead,
-        )
+        facing = np.minimum(np.einsum("ni,ni->n", looks[:, one], axis), towards)
+        middle, approach = 0.5 * (a + b), hand.palm.approach
+        square, ahead = np.abs(axis @ approach), (middle - hand.palm.centre) @ approach
+        return cls(axis, middle, width, facing, square, ahead)
 
     def cost(self, wanted: Floats) -> Floats:
         """Return the cost (N,) of postures as oppositions of the widths `wanted` (N,)."""
@@ -221,11 +207,10 @@ def require_opposing(hand: HandModel) -> None:
     bare = [hand.body_names[tip] for tip in hand.fingertips if tip not in shaped]
     if bare:
         raise HandError(
-            f"{hand.name}: no two opposing digits: {', '.join(bare[:4])} have no collision shapes; give the hand with "
-            "its fingers"
+            f"{hand.name}: no two opposing digits: {', '.join(bare[:4])} have no collision shapes; add the fingers"
         )
     raise HandError.with_fixes(
-        f"{hand.name}: no two opposing digits: no two surfaces of it face each other and close, so it can hold nothing",
+        f"{hand.name}: no two opposing digits: no two surfaces face each other and close, so nothing can be held",
         "give the whole hand, or another --root",
         {"root": None},
     )
@@ -244,8 +229,7 @@ def can_oppose(hand: HandModel) -> bool:
     shares = [closing_posture(hand, share) for share in np.linspace(0, 1, 5)]
     q = np.concatenate([shares, rng.uniform(hand.lower, hand.upper, (_CHECKED_AT_RANDOM, hand.dofs))])
     poses = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))[:, points.body]
-    position = quat_rotate(poses[..., 3:], points.position) + poses[..., :3]
-    normal = quat_rotate(poses[..., 3:], points.normal)
+    position, normal = apply(poses, points.position), quat_rotate(poses[..., 3:], points.normal)
     apart = points.body[:, None] != points.body[None]
     gaps = np.linalg.norm(position[0][:, None] - position[0][None], axis=2)
     least, most = gaps.copy(), gaps.copy()

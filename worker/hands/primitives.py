@@ -25,8 +25,7 @@ SEGMENTS = 32
 
 
 def hull(points: Floats) -> tuple[Floats, Ints]:
-    """Compute corners (V, 3) and outward triangles (F, 3) of the convex hull of points (N, 3).
-    Raises HandError: the points lie in a plane."""
+    """Compute corners (V, 3) and outward triangles (F, 3) of a hull of points (N, 3); HandError if flat."""
     made = cached_step("hull", [points], lambda: compute_hull(points))
     return made["0"], made["1"]
 
@@ -103,10 +102,8 @@ def sample(
     # Stratified over the faces: each face gets its share of the number, rounded up or down.
     ladder = (np.arange(count) + rng.random()) / max(count, 1) * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder, side="right"), len(faces) - 1)
-    points, normals = (
-        points_on_faces(vertices[faces[face]], *rng.random((2, count, 1))),
-        face_vectors(vertices, faces[face]),
-    )
+    points = points_on_faces(vertices[faces[face]], *rng.random((2, count, 1)))
+    normals = face_vectors(vertices, faces[face])
     return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
@@ -132,8 +129,7 @@ def _sample_round(kind: str, size: tuple[float, ...], count: int, rng: np.random
 
 def signed_distance(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints, points: Floats) -> Floats:
     """Compute the distance (N,) of points (N, 3), negative inside.
-    Exact inside every kind and everywhere for spheres and capsules; outside boxes, cylinders and hulls it is a lower
-    bound with the right sign."""
+    Outside boxes, cylinders and hulls it is a lower bound with the right sign; elsewhere it is exact."""
     match kind:
         case "box":
             return (np.abs(points) - np.asarray(size) / 2).max(axis=1)
@@ -169,22 +165,14 @@ class HandFeatures:
     """F balls and rims, and E edges, of P convex pieces; fixed to the bodies of a hand.
     A plane meets balls and rims first; a convex solid that penetrates a piece meets one of them or an edge."""
 
-    body: NDArray[np.int32]
-    """(F,)"""
-    centre: Floats
-    """(F, 3) body frame."""
-    axis: Floats
-    """(F, 3) axis of a rim, body frame; zero for a ball."""
-    radius: Floats
-    """(F,) [m]"""
-    first: NDArray[np.int32]
-    """(P + 1,) the first feature of each piece."""
-    edges: Floats
-    """(E, 2, 3) ends, body frame."""
-    thickness: Floats
-    """(E,) radius about an edge: 0 except for capsules and spheres."""
-    first_edge: NDArray[np.int32]
-    """(P + 1,) the first edge of each piece."""
+    body: NDArray[np.int32]  # (F,)
+    centre: Floats  # (F, 3) body frame
+    axis: Floats  # (F, 3) axis of a rim, body frame; zero for a ball
+    radius: Floats  # (F,) [m]
+    first: NDArray[np.int32]  # (P + 1,) the first feature of each piece
+    edges: Floats  # (E, 2, 3) ends, body frame
+    thickness: Floats  # (E,) radius about an edge: 0 except for capsules and spheres
+    first_edge: NDArray[np.int32]  # (P + 1,) the first edge of each piece
 
     def __len__(self) -> int:
         return len(self.body)

@@ -33,8 +33,7 @@ class Shape:
     kind: str
     size: tuple[float, ...]
     pose: Floats
-    filename: str = ""
-    """File of a mesh."""
+    filename: str = ""  # file of a mesh
     mesh: tuple[Floats, Ints] | None = None
     """Vertices (V, 3) and triangles (F, 3) of a mesh that the robot's reader has loaded."""
     colour: tuple[float, float, float] | None = None
@@ -46,8 +45,7 @@ class Link:
     """A link; mass is None if the robot's description gives none."""
 
     name: str
-    shapes: tuple[Shape, ...]
-    """Collision elements."""
+    shapes: tuple[Shape, ...]  # collision elements
     mass: float | None
     visuals: tuple[Shape, ...] = ()
 
@@ -73,19 +71,14 @@ class Joint:
     axis: Floats = field(default_factory=lambda: np.array([1.0, 0, 0]))
     lower: float = 0.0
     upper: float = 0.0
-    effort: float = 0.0
-    """Limit [N m or N]; 0 if not stated."""
+    effort: float = 0.0  # limit [N m or N]; 0 if not stated
     mimic: Mimic | None = None
-    """Mimic relation. A URDF follower's own limits are ignored, as in ROS: most published limits of followers are
-    wrong."""
-    velocity: float = 0.0
-    """Limit [rad/s or m/s]; 0 if not stated."""
-    stiffness: float = 0.0
-    """Position gain of the joint's servo [N m/rad or N/m]; 0 if not stated."""
+    """Own limits of a URDF follower are ignored, as in ROS: most published ones are wrong."""
+    velocity: float = 0.0  # limit [rad/s or m/s]; 0 if not stated
+    stiffness: float = 0.0  # position gain of the joint's servo [N m/rad or N/m]; 0 if not stated
     armature: float = field(default=0.0, metadata=TOLD_IF_SET)
     """Inertia that the drive adds [kg m^2 or kg]; 0 if not stated."""
-    dry_friction: float = field(default=0.0, metadata=TOLD_IF_SET)
-    """[N m or N]; 0 if not stated."""
+    dry_friction: float = field(default=0.0, metadata=TOLD_IF_SET)  # [N m or N]; 0 if not stated
     fault: str = field(default="", metadata=TOLD_IF_SET)
     """Error for a hand that moves by this joint. Above a hand the joint is fixed and the fault is ignored."""
 
@@ -102,8 +95,7 @@ class Robot:
     links: dict[str, Link]
     joints: dict[str, Joint]
     root: str
-    notes: tuple[str, ...] = field(default=())
-    """Accepted anomalies to report to the user."""
+    notes: tuple[str, ...] = field(default=())  # accepted anomalies to report to the user
     format: str = "URDF"
     tendons: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Drives that pull several joints: the coefficient of each joint."""
@@ -147,6 +139,7 @@ def _by_name(parts: Iterable[Any], duplicate: str) -> dict[str, Any]:
 
 
 def chain_to(robot: Robot, link: str) -> tuple[Joint, ...]:
+    """Return the joints from the robot's root to a link."""
     carrier = {joint.child: joint for joint in robot.joints.values()}
     found: list[Joint] = []
     while link in carrier:
@@ -166,13 +159,13 @@ def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str)
         parent_of[joint.child] = joint.parent
     roots = [name for name in links if name not in parent_of]
     if len(roots) != 1:
-        if not links:
+        if not links and filename.endswith(".xacro"):
             raise HandError(
                 f"{filename}: it expands to no link at all: it only defines macros (give the file that calls them), or "
                 "an <include> lacks its xacro: prefix"
-                if filename.endswith(".xacro")
-                else f"{filename}: it contains no link; give the description of a hand"
             )
+        if not links:
+            raise HandError(f"{filename}: it contains no link; give the description of a hand")
         found = ", ".join(map(repr, roots[:3])) or "none: the joints form a cycle"
         raise HandError(f"{filename}: a hand needs exactly one root link; found {found}")
     for link in links:

@@ -1,5 +1,5 @@
 """Collision shapes of a robot as convex pieces.
-Primitives stay exact. A mesh becomes one hull, or several hulls if one would enclose surface that can touch objects.
+Primitives stay exact. A mesh becomes one hull, or several hulls if its surface lies deep inside one hull.
 
 The error of a mesh's pieces is the depth of the mesh surface beneath them, along the shortest free direction outward.
 The ninth decile over the visible outer surface counts."""
@@ -64,6 +64,7 @@ def make_pieces(
 
 
 def _mesh_hulls(name: str, scale: tuple[float, ...], data: bytes, link: str) -> list[tuple[Floats, Ints]]:
+    """Return the hulls of a mesh file; HandError if the mesh is unreadable or longer than `MAX_PIECE_M`."""
     try:
         soup = read_mesh(name, data)
     except MeshError as error:
@@ -78,27 +79,26 @@ def _mesh_hulls(name: str, scale: tuple[float, ...], data: bytes, link: str) -> 
 
 
 def _hulls(points: Floats, faces: Ints) -> list[tuple[Floats, Ints]]:
-    parts = convex_parts(points, faces)
-    # Hulls use all points of a file, including points that no face uses.
-    return [reduce_hull(part) for part in (parts if len(parts) > 1 else (points,))]
+    # Hulls use all points of a file, including points that no face uses: `convex_parts` returns them for one hull.
+    return [reduce_hull(part) for part in convex_parts(points, faces)]
 
 
-def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats, Ints]:
-    """Compute a convex hull of points (N, 3) with at most `limit` corners and the volume of the full hull.
+def reduce_hull(points: Floats) -> tuple[Floats, Ints]:
+    """Compute a hull of points (N, 3) with at most `MAX_HULL_VERTICES` corners and the full hull's volume.
     The corner farthest from the current hull is added repeatedly; then all are scaled about their centroid until the
     volumes agree. The surface error has both signs and half the size of an inscribed hull's error."""
-    made = cached_step("reduced hull", [points, np.array(limit)], lambda: _reduce(points, limit))
+    made = cached_step("reduced hull", [points, np.array(MAX_HULL_VERTICES)], lambda: _reduce(points))
     return made["0"], made["1"]
 
 
-def _reduce(points: Floats, limit: int) -> tuple[Floats, Ints]:
+def _reduce(points: Floats) -> tuple[Floats, Ints]:
     vertices, faces = compute_hull(points)
-    if len(vertices) <= limit:
+    if len(vertices) <= MAX_HULL_VERTICES:
         return vertices, faces
     full = volume("hull", (), vertices, faces)
     directions = np.concatenate([np.eye(3), -np.eye(3)])
     chosen = list(dict.fromkeys(np.argmax(vertices @ directions.T, axis=0).tolist()))
-    while len(chosen) < limit:
+    while len(chosen) < MAX_HULL_VERTICES:
         farthest = int(np.argmax(_excess_distance(vertices, vertices[chosen])))
         if farthest in chosen:
             break
@@ -133,8 +133,9 @@ _COACD: Final = {
 }
 #: Number of faces to which a mesh is simplified before its decomposition.
 _FACES: Final = 1200
-#: CPU time limit of a CoACD run [s]: twice the time of the slowest mesh of 1200 faces (58 s).
+#: CPU time limit of a CoACD run [s]: twice the time of the slowest mesh of 1,200 faces.
 _CPU_S: Final = 120
+#: Number of points that measure a mesh's error, and their share with a smaller error than the reported one.
 _POINTS: Final = 200
 _SHARE: Final = 0.9
 #: Largest depth beneath the hull at which a surface is not hollow [m].
@@ -152,19 +153,17 @@ _MIN_EXTENT_M: Final = 1e-3
 def convex_parts(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
     """Return corners of the convex pieces of a mesh, or all its corners if its hull is accurate.
     Raises HandError: the decomposition exceeds its CPU time limit."""
-    whole: tuple[Floats, ...] = (vertices,)
     if _is_convex(vertices, faces):
-        return whole
+        return (vertices,)
     shape = hashlib.sha256(np.ascontiguousarray(vertices).tobytes() + np.ascontiguousarray(faces).tobytes())
     settings = [_COACD, list(_THRESHOLDS), MAX_ERROR_M, _POINTS, _FACES, version_of("coacd")]
     file = default_cache() / f"hand-{digest_json({'shape': shape.hexdigest(), 'settings': settings})}.npz"
-    kept = load_parts(file) if file.is_file() else None
-    if kept:
-        return kept if len(kept) > 1 else whole
+    if file.is_file() and (kept := load_parts(file)):
+        return kept if len(kept) > 1 else (vertices,)
     best, sure = _decompose(vertices, faces)
     if sure:
         save_parts(file, best if len(best) > 1 else (np.zeros((1, 3)),))
-    return best
+    return best if len(best) > 1 else (vertices,)
 
 
 def _decompose(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool]:

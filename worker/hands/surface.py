@@ -31,21 +31,18 @@ COINCIDENT_M: Final = 1e-6
 
 def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoints:
     """Sample exactly `count` points on the union of the hand's pieces.
-    Area-uniform candidates are thinned to a blue-noise subset, body by body, by farthest-point selection. Each point
-    gets the area of its Voronoi cell among the candidates, so the areas sum to the exterior area. Parts inside another
-    piece have no points. Equal arguments give the same points, bit for bit. Raises HandError: the hand has no outer
-    surface."""
+    Area-uniform candidates are thinned body by body by farthest-point selection. Each point gets the area of its
+    Voronoi cell among the candidates, so the areas sum to the exterior area. Parts inside another piece have no points.
+    Raises HandError: the hand has no outer surface."""
     # The cache key excludes closing and palm, since these are derived from such points.
-    return _cached_samples(
-        _Shapes(hand.pieces, body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]), count, seed
-    )
+    rest = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
+    return _cached_samples(_Shapes(hand.pieces, rest), count, seed)
 
 
 @dataclass(frozen=True)
 class _Shapes:
     pieces: tuple[ConvexPiece, ...]
-    rest: Floats
-    """(L, 7) poses of the hand's bodies."""
+    rest: Floats  # (L, 7) poses of the hand's bodies
 
     @cached_property
     def content(self) -> str:
@@ -75,8 +72,7 @@ def _sample(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
     area_of_body = np.bincount(candidates.body, candidates.area, minlength=bodies).astype(float)
     available = np.bincount(candidates.body, minlength=bodies)
     quota = apportion(area_of_body, count, available)
-    chosen: list[NDArray[np.intp]] = []
-    areas: list[Floats] = []
+    chosen, areas = [], []
     for body in np.flatnonzero(quota):
         mine = np.flatnonzero(candidates.body == body)
         spacing = np.sqrt(area_of_body[body] / quota[body])
@@ -97,19 +93,15 @@ def _candidates(hand: _Shapes, count: int, seed: int) -> SurfacePoints:
     rng = np.random.default_rng([seed, 0x5EED])
     shares = np.array([primitives.area(p.kind, p.size, p.vertices, p.faces) for p in hand.pieces])
     numbers = np.maximum(np.ceil(count * shares / shares.sum()).astype(int), 8)
-    bodies, positions, normals, areas = [], [], [], []
+    parts = []
     for i, (piece, number) in enumerate(zip(hand.pieces, numbers, strict=True)):
-        local, direction = primitives.sample(
-            piece.kind, piece.size, _local_vertices(piece), piece.faces, int(number), rng
-        )
-        position = apply(piece.pose, local)
-        normal = quat_rotate(piece.pose[3:], direction)
+        vertices = _local_vertices(piece)
+        local, direction = primitives.sample(piece.kind, piece.size, vertices, piece.faces, int(number), rng)
+        position, normal = apply(piece.pose, local), quat_rotate(piece.pose[3:], direction)
         keep = ~_is_buried(hand, i, position, normal)
-        bodies.append(np.full(int(keep.sum()), piece.body, dtype=np.int32))
-        positions.append(position[keep])
-        normals.append(normal[keep])
-        areas.append(np.full(int(keep.sum()), shares[i] / number))
-    return SurfacePoints(*(np.concatenate(parts) for parts in (bodies, positions, normals, areas)))
+        body, area = np.full(len(keep), piece.body, np.int32), np.full(len(keep), shares[i] / number)
+        parts.append((body[keep], position[keep], normal[keep], area[keep]))
+    return SurfacePoints(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 def _local_vertices(piece: ConvexPiece) -> Floats:
@@ -125,8 +117,7 @@ def piece_distance(piece: ConvexPiece, points: Floats) -> Floats:
 def _is_buried(hand: _Shapes, own: int, position: Floats, normal: Floats) -> NDArray[np.bool_]:
     """Return a mask (N,) of points of piece `own` inside another piece or on a face of an earlier piece."""
     mine = hand.pieces[own]
-    above = position + COINCIDENT_M * normal
-    below = position - COINCIDENT_M * normal
+    above, below = position + COINCIDENT_M * normal, position - COINCIDENT_M * normal
     world = apply(hand.rest[mine.body], position)
     low, high = world.min(axis=0), world.max(axis=0)
     buried = np.zeros(len(position), dtype=bool)

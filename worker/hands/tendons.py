@@ -41,8 +41,7 @@ class Tendon:
 
 
 def actuator_matrix(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
-    """Return the matrix (A, D) from dof values to lengths of the drives, in dof order.
-    A tendon has the place of its first dof."""
+    """Return the matrix (A, D) from dof values to drive lengths; a tendon has its first dof's place."""
     rows = np.eye(dofs)
     others: list[int] = []
     for tendon in tendons:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
@@ -40,27 +39,20 @@ class Tree:
     """Bodies with parents first; body 0 is the root."""
 
     bodies: tuple[Body, ...]
-    links: dict[str, tuple[int, Floats]]
-    """Body of each retained link, and its pose in the body's frame."""
-    drives: dict[str, Mimic]
-    """Degree of freedom that each moving joint follows, by name of the joint."""
-    joint_names: tuple[str, ...]
-    """Moving joints in the robot's order."""
-    dof_names: tuple[str, ...]
-    """Independent joints in the robot's order."""
+    links: dict[str, tuple[int, Floats]]  # body of each retained link, and its pose in the body's frame
+    drives: dict[str, Mimic]  # degree of freedom that each moving joint follows, by name of the joint
+    joint_names: tuple[str, ...]  # moving joints in the robot's order
+    dof_names: tuple[str, ...]  # independent joints in the robot's order
     lower: Floats
     upper: Floats
     velocity: Floats
-    still: tuple[str, ...]
-    """Joints fixed because their limits leave one value."""
-    known: frozenset[str]
-    """Names of all joints and links of the robot, dropped and frozen ones too."""
+    still: tuple[str, ...]  # joints fixed because their limits leave one value
+    known: frozenset[str]  # names of all joints and links of the robot, dropped and frozen ones too
 
 
 def build_tree(robot: Robot, options: HandOptions) -> Tree:
     """Build the body tree of a hand.
-    Raises HandError: an option names an unknown joint or link, nothing moves, or couplings leave a degree of freedom no
-    range."""
+    Raises HandError: an option names an unknown joint or link, nothing moves, or couplings leave a dof no range."""
     _check_names(robot, options)
     # A joint on a tendon follows nothing: it is free within its limits.
     pulled = {joint for pulls in (options.tendons or {}).values() for joint in pulls}
@@ -91,15 +83,14 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
                 f"fix it: --fix {name}=0",
                 {"fix": {name: 0}},
             )
-    if not moving and still:
-        shown = ", ".join(list(still)[:6]) + (", ..." if len(still) > 6 else "")
-        raise HandError(f"no moving joint is left: the limits of {shown} leave one value; fill them in")
     if not moving:
+        if still:
+            shown = ", ".join(list(still)[:6]) + (", ..." if len(still) > 6 else "")
+            raise HandError(f"no moving joint is left: the limits of {shown} leave one value; fill them in")
         if options.fix or options.drop:
             raise HandError("no moving joint is left; fix or drop fewer joints")
-        raise HandError.with_fixes(
-            f"no moving joint is left; nothing below {root!r} moves", "name another --root", {"root": None}
-        )
+        fault = f"no moving joint is left; nothing below {root!r} moves"
+        raise HandError.with_fixes(fault, "name another --root", {"root": None})
     names = tuple(name for name in robot.joints if name in moving)
     dofs = tuple(name for name in names if moving[name].joint == name)
     lower, upper = np.array([_fold_limits(dof, moving, robot, options) for dof in dofs]).T
@@ -167,9 +158,8 @@ def _fold_limits(dof: str, moving: dict[str, Mimic], robot: Robot, options: Hand
         if not _limits_bind(joint, drive, robot, options):
             continue
         if joint.type == "prismatic" and joint.upper - joint.lower >= 2 * UNLIMITED_M:
-            raise HandError.with_fixes(
-                f"joint {name!r} slides without a range", f"give it one, or fix it: --fix {name}=0", {"fix": {name: 0}}
-            )
+            fault, fix = f"joint {name!r} slides without a range", f"give it a range, or fix it: --fix {name}=0"
+            raise HandError.with_fixes(fault, fix, {"fix": {name: 0}})
         ends = sorted((limit - drive.offset) / drive.multiplier for limit in (joint.lower, joint.upper))
         if ends[0] > lower or ends[1] < upper:
             narrowest = name
@@ -197,7 +187,7 @@ def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Mimic]
 
 
 def _limits_bind(joint: Joint, drive: Mimic, robot: Robot, options: HandOptions) -> bool:
-    """Check whether a joint's own limits bind; those of a URDF follower do not, as in ROS: most are wrong."""
+    """Check whether a joint's own limits bind; those of a URDF follower do not, see `Joint.mimic`."""
     return joint.name == drive.joint or robot.format != "URDF" or joint.name in options.couplings
 
 
@@ -216,12 +206,11 @@ def exceeded_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]
 
 def reduced_ranges(robot: Robot, tree: Tree) -> list[str]:
     """Return notes on dofs whose range is reduced by their followers' limits."""
-    found = []
-    for dof, lower, upper in zip(tree.dof_names, tree.lower, tree.upper, strict=True):
-        own = robot.joints[dof]
-        if upper - lower < (1 - _TOLD_CUT) * (own.upper - own.lower):
-            found.append(f"joints that follow {dof} limit it to {lower:.3g} .. {upper:.3g}")
-    return found
+    return [
+        f"joints that follow {dof} limit it to {lower:.3g} .. {upper:.3g}"
+        for dof, lower, upper in zip(tree.dof_names, tree.lower, tree.upper, strict=True)
+        if upper - lower < (1 - _TOLD_CUT) * (robot.joints[dof].upper - robot.joints[dof].lower)
+    ]
 
 
 def _fold_velocity(dof: str, moving: dict[str, Mimic], robot: Robot) -> float:
@@ -275,8 +264,8 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
     Raises HandError: the robot has several hands, or is an arm without a hand; the message names the hands."""
     if options.root:
         return options.root
-    root, drop = robot.root, set(options.drop)
-    while root in drop:
+    root = robot.root
+    while root in options.drop:
         children = [j.child for j in robot.joints.values() if j.parent == root]
         if len(children) != 1:
             raise HandError(f"link {root!r} is dropped and has {len(children)} children; name the new root link")
@@ -303,14 +292,12 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
 def hand_links(tree: _JointTree, root: str) -> list[str]:
     """Return the links, from the root down, at which a hand begins: several short fingers branch there."""
     found: list[str] = []
-    queue = deque([root])
-    while queue:
-        link = queue.popleft()
-        fingers = tree.joints_onward(link)
-        if len(fingers) > 1 and tree.reach[link] <= MAX_FINGER_M and tree.has_shaped_branches(link):
+    queue = [root]
+    for link in queue:
+        if tree.reach[link] <= MAX_FINGER_M and tree.has_shaped_branches(link):
             found.append(link)
         else:
-            queue.extend(joint.child for joint in fingers)
+            queue += [joint.child for joint in tree.joints_onward(link)]
     return found
 
 
@@ -350,12 +337,12 @@ class _JointTree:
         return [joint for joint in self._children.get(link, []) if self.is_free_below(joint)]
 
     def has_shaped_branches(self, link: str) -> bool:
+        """Check whether at least two moving branches below a link have shapes."""
         return sum(self._has_shape(joint.child) for joint in self.joints_onward(link)) > 1
 
     def _has_shape(self, link: str) -> bool:
-        if self.robot.links[link].shapes:
-            return True
-        return any(self._has_shape(joint.child) for joint in self._children.get(link, []))
+        below = (joint.child for joint in self._children.get(link, []))
+        return bool(self.robot.links[link].shapes) or any(map(self._has_shape, below))
 
 
 def _link_below_arm(tree: _JointTree, root: str, options: HandOptions) -> str:
@@ -367,8 +354,6 @@ def _link_below_arm(tree: _JointTree, root: str, options: HandOptions) -> str:
         if len(onward) != 1:
             # A tree without branches is a single finger, so nothing above it is an arm.
             return start if onward else root
-        (joint,) = onward
-        at = joint.child
-        if tree.is_free(joint):
-            start = at
+        at = onward[0].child
+        start = at if tree.is_free(onward[0]) else start
     return start

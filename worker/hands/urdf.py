@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from typing import Final
 from xml.etree.ElementTree import Element, ParseError
@@ -17,7 +16,7 @@ from defusedxml import ElementTree as SafeTree
 from defusedxml.common import DefusedXmlException
 
 from graspd.service.model.errors import HandError, LimitError
-from graspd.service.model.transforms import Floats, quat_from_axis_angle, quat_multiply
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_from_axis_angle, quat_multiply
 from graspd.service.store.hand_files import text_of
 from graspd.worker.hands.robot import MAX_LENGTH_M, MOVING, UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
 
@@ -29,8 +28,7 @@ Colour = tuple[float, float, float]
 
 def read_urdf(data: bytes, filename: str = "the URDF") -> Robot:
     """Read and check a URDF.
-    Raises HandError: not XML, not a robot, or a value that no hand can have; the message names it. LimitError: larger
-    than the limits of this module."""
+    Raises HandError: not XML, not a robot, or a value that no hand can have. LimitError: larger than `MAX_BYTES`."""
     robot = parse_xml(data, filename, "a URDF", "robot", limit_bytes=MAX_BYTES)
     notes: list[str] = []
     materials = {element.get("name", ""): _colour(element) for element in robot.findall("material")}
@@ -39,7 +37,7 @@ def read_urdf(data: bytes, filename: str = "the URDF") -> Robot:
     return build_robot(robot.get("name", ""), links, joints, notes, filename)
 
 
-def _read_link(element: ElementTree.Element, materials: dict[str, Colour | None]) -> Link:
+def _read_link(element: Element, materials: dict[str, Colour | None]) -> Link:
     name = _name(element, "link")
     shapes = tuple(_read_shape(collision, f"collision of link {name!r}") for collision in element.findall("collision"))
     mass_element = element.find("inertial/mass")
@@ -49,7 +47,7 @@ def _read_link(element: ElementTree.Element, materials: dict[str, Colour | None]
     return Link(name, shapes, mass if mass else None, _read_visuals(element, name, materials))
 
 
-def _read_visuals(element: ElementTree.Element, link: str, materials: dict[str, Colour | None]) -> tuple[Shape, ...]:
+def _read_visuals(element: Element, link: str, materials: dict[str, Colour | None]) -> tuple[Shape, ...]:
     """Read visual elements; unusable ones are left out, since only pictures need them."""
     found = []
     for visual in element.findall("visual")[:MAX_VISUALS]:
@@ -63,7 +61,7 @@ def _read_visuals(element: ElementTree.Element, link: str, materials: dict[str, 
     return tuple(found)
 
 
-def _colour(material: ElementTree.Element) -> Colour | None:
+def _colour(material: Element) -> Colour | None:
     node = material.find("color")
     try:
         values = [float(part) for part in (node.get("rgba") or "")[:200].split()] if node is not None else []
@@ -74,11 +72,9 @@ def _colour(material: ElementTree.Element) -> Colour | None:
     return values[0], values[1], values[2]
 
 
-def _read_shape(element: ElementTree.Element, what: str) -> Shape:
+def _read_shape(element: Element, what: str) -> Shape:
     pose = _origin(element, what)
-    geometry = element.find("geometry")
-    shape = None if geometry is None else next(iter(geometry), None)
-    if shape is None:
+    if (shape := element.find("geometry/*")) is None:
         raise HandError(f"{what} has no geometry; give a box, cylinder, sphere, capsule or mesh")
     match shape.tag:
         case "box":
@@ -102,14 +98,13 @@ def _read_shape(element: ElementTree.Element, what: str) -> Shape:
     return Shape(shape.tag, size, pose)
 
 
-def _read_joint(element: ElementTree.Element, notes: list[str]) -> Joint:
+def _read_joint(element: Element, notes: list[str]) -> Joint:
     name = _name(element, "joint")
     what = f"joint {name!r}"
     kind = element.get("type", "")
     ends = [element.find(tag) for tag in ("parent", "child")]
     parent, child = ("" if end is None else end.get("link", "") for end in ends)
-    origin = _origin(element, what)
-    still = Joint(name, kind, parent, child, origin)
+    still = Joint(name, kind, parent, child, _origin(element, what))
     if kind == "fixed":
         return still
     try:
@@ -119,7 +114,7 @@ def _read_joint(element: ElementTree.Element, notes: list[str]) -> Joint:
         return replace(still, fault=str(error))
 
 
-def _movable_joint(element: ElementTree.Element, still: Joint, what: str, notes: list[str]) -> Joint:
+def _movable_joint(element: Element, still: Joint, what: str, notes: list[str]) -> Joint:
     """Return the joint with its axis and limits; raise HandError if no hand can have it."""
     if still.type not in MOVING:
         raise HandError(
@@ -134,18 +129,11 @@ def _movable_joint(element: ElementTree.Element, still: Joint, what: str, notes:
             raise
         most = UNLIMITED_M if still.type == "prismatic" else math.pi
         lower, upper, effort = -most, most, 0.0
-    return replace(
-        still,
-        axis=_axis(element, what, notes),
-        lower=lower,
-        upper=upper,
-        effort=effort,
-        mimic=mimic,
-        velocity=_velocity_limit(element),
-    )
+    axis, velocity = _axis(element, what, notes), _velocity_limit(element)
+    return replace(still, axis=axis, lower=lower, upper=upper, effort=effort, mimic=mimic, velocity=velocity)
 
 
-def _velocity_limit(element: ElementTree.Element) -> float:
+def _velocity_limit(element: Element) -> float:
     """Return the speed limit [rad/s or m/s]; 0 without a plausible one, since grasps do not need it."""
     limit = element.find("limit")
     try:
@@ -155,7 +143,7 @@ def _velocity_limit(element: ElementTree.Element) -> float:
     return value if math.isfinite(value) else 0.0
 
 
-def _axis(element: ElementTree.Element, what: str, notes: list[str]) -> Floats:
+def _axis(element: Element, what: str, notes: list[str]) -> Floats:
     node = element.find("axis")
     axis = np.array([1.0, 0, 0]) if node is None else np.array(_vector(node, "xyz", f"axis of {what}"))
     length = float(np.linalg.norm(axis))
@@ -166,7 +154,7 @@ def _axis(element: ElementTree.Element, what: str, notes: list[str]) -> Floats:
     return axis / length
 
 
-def _limits(element: ElementTree.Element, kind: str, what: str) -> tuple[float, float, float]:
+def _limits(element: Element, kind: str, what: str) -> tuple[float, float, float]:
     """Return lower and upper limit [rad or m] and effort [N m or N]; a continuous joint gets one turn."""
     limit = element.find("limit")
     if kind == "continuous":
@@ -184,7 +172,7 @@ def _limits(element: ElementTree.Element, kind: str, what: str) -> tuple[float, 
     return lower, upper, effort
 
 
-def _mimic(element: ElementTree.Element, what: str) -> Mimic | None:
+def _mimic(element: Element, what: str) -> Mimic | None:
     node = element.find("mimic")
     if node is None:
         return None
@@ -193,14 +181,14 @@ def _mimic(element: ElementTree.Element, what: str) -> Mimic | None:
     return Mimic(node.get("joint", ""), multiplier, offset)
 
 
-def _name(element: ElementTree.Element, what: str) -> str:
+def _name(element: Element, what: str) -> str:
     name = element.get("name", "")
     if not name or len(name) > 128 or not name.isprintable():
         raise HandError(f"a {what} has no usable name ({name[:20]!r}); give 1 to 128 printable characters")
     return name
 
 
-def _number(element: ElementTree.Element, key: str, what: str, default: float | None = None) -> float:
+def _number(element: Element, key: str, what: str, default: float | None = None) -> float:
     text = element.get(key)
     if text is None and default is not None:
         return default
@@ -213,9 +201,7 @@ def _number(element: ElementTree.Element, key: str, what: str, default: float | 
     return value
 
 
-def _vector(
-    element: ElementTree.Element, key: str, what: str, default: tuple[float, ...] | None = None
-) -> tuple[float, ...]:
+def _vector(element: Element, key: str, what: str, default: tuple[float, ...] | None = None) -> tuple[float, ...]:
     text = element.get(key)
     if text is None and default is not None:
         return default
@@ -228,25 +214,20 @@ def _vector(
     return values
 
 
-def _origin(element: ElementTree.Element, what: str) -> Floats:
+def _origin(element: Element, what: str) -> Floats:
     node = element.find("origin")
     if node is None:
-        return np.array([0.0, 0, 0, 1, 0, 0, 0])
+        return IDENTITY_POSE.copy()
     xyz = _vector(node, "xyz", f"origin of {what}", default=(0.0, 0.0, 0.0))
     rpy = _vector(node, "rpy", f"origin of {what}", default=(0.0, 0.0, 0.0))
     if max(map(abs, xyz)) > MAX_LENGTH_M:
         raise HandError(f"origin of {what} lies {max(map(abs, xyz)):g} m away; URDF lengths are metres")
-    return np.concatenate([xyz, quat_from_rpy(*rpy)])
+    # Rotations about the fixed axes x, then y, then z.
+    x, y, z = quat_from_axis_angle(np.eye(3), np.array(rpy))
+    return np.concatenate([xyz, quat_multiply(z, quat_multiply(y, x))])
 
 
-def quat_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
-    """Return the unit quaternion w x y z of rotations about the fixed axes x, then y, then z [rad]."""
-    x, y, z = (
-        quat_from_axis_angle(axis, np.asarray(angle)) for axis, angle in zip(np.eye(3), (roll, pitch, yaw), strict=True)
-    )
-    return quat_multiply(z, quat_multiply(y, x))
-
-
+#: Prefix of a tag or attribute; the first tag of a text.
 _PREFIX: Final = re.compile(r"[<\s/]([A-Za-z_][\w.-]{0,40}):[A-Za-z_]")
 _FIRST: Final = re.compile(r"<[A-Za-z_][\w:.-]*")
 _MAX_PREFIXES: Final = 100
@@ -254,8 +235,7 @@ _MAX_PREFIXES: Final = 100
 
 def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_bytes: int) -> Element:
     """Return the root element without its namespace.
-    Raises HandError: it is empty, not XML, or has another root element than `root`; the message calls it `what`.
-    LimitError: larger than the limit."""
+    Raises HandError: empty, not XML, or another root than `root` (`what` in the message). LimitError: larger."""
     if len(data) > limit_bytes:
         raise LimitError(f"{name}: {len(data)} bytes of XML; at most {limit_bytes} are taken")
     text = text_of(data)

@@ -8,6 +8,7 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import count
 from typing import Final
 
 import numpy as np
@@ -29,17 +30,14 @@ class VisualMesh:
     """Triangle mesh of one colour on a body."""
 
     body: int
-    vertices: Floats
-    """(V, 3) in the body frame [m]."""
-    faces: Ints
-    """(F, 3)"""
-    colour: tuple[float, float, float] | None
-    """sRGB, 0 .. 1; None if not stated."""
+    vertices: Floats  # (V, 3) in the body frame [m]
+    faces: Ints  # (F, 3)
+    colour: tuple[float, float, float] | None  # sRGB, 0 .. 1; None if not stated.
 
 
 @dataclass(frozen=True)
 class PlacedShape:
-    """Visual element, the body it moves with, its (7,) pose in the body's frame, and its link."""
+    """Visual element, its body, its pose (7,) in the body's frame, and its link."""
 
     shape: Shape
     body: int
@@ -53,8 +51,7 @@ class Visuals:
 
     placed: Sequence[PlacedShape] = ()
     files: Mapping[str, bytes] = field(default_factory=dict, repr=False)
-    base: str = ""
-    """Folder of the robot's description inside `files`."""
+    base: str = ""  # folder of the robot's description inside `files`
 
     @cached_property
     def content(self) -> str:
@@ -133,17 +130,13 @@ def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dic
 
 def _mesh_files(mesh: str, files: Mapping[str, bytes]) -> Nearby:
     """Return a lookup of the hand's files that a mesh and its material libraries name, up to `MAX_NAMES`."""
-    naming = [mesh]
-    asked = 0
+    naming, lookups = [mesh], count()
 
     def find(reference: str) -> bytes | None:
-        nonlocal asked
-        asked += 1
-        if asked > MAX_NAMES:
+        if next(lookups) >= MAX_NAMES:
             return None
         found = (resolve(one, reference, files.__contains__) for one in reversed(naming))
-        name = next((one for one in found if one), None)
-        if name is None:
+        if (name := next(filter(None, found), None)) is None:
             return None
         if name.lower().endswith(".mtl"):
             naming.append(name)

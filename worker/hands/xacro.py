@@ -32,8 +32,7 @@ _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 def expand_xacro(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) -> bytes:
     """Expand a xacro file to a URDF, with values of its `<xacro:arg>`.
     Includes and `$(find PACKAGE)` are searched among the hand's files only. Raises HandError: the file cannot be
-    expanded, or refers to files outside the hand's folder. OSError: the child was killed or hung; the file is not at
-    fault."""
+    expanded, or refers to files outside the hand's folder. OSError: the child process was killed or hung."""
     given = {
         "main": main,
         "arguments": dict(arguments),
@@ -44,10 +43,9 @@ def expand_xacro(files: Mapping[str, bytes], main: str, arguments: Mapping[str, 
         "texts": {name: text_of(files[name]) for name in sorted(files) if PurePosixPath(name).suffix.lower() in _READ},
     }
     passed_on = {name: os.environ[name] for name in ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH") if name in os.environ}
-    command = [sys.executable, "-m", "graspd.worker.hands.xacro_child"]
     try:
         done = subprocess.run(
-            command,
+            [sys.executable, "-m", "graspd.worker.hands.xacro_child"],
             input=json.dumps(given).encode(),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

@@ -32,7 +32,7 @@ _FRAMES: Final = ("gi_", "cr_", "ag_", "f_", "tb_", "co_", "func_")
 
 
 class Refused(Exception):
-    """The file requests something forbidden."""
+    """The file needs access that the process does not have, or has an invalid expression."""
 
 
 def main() -> None:
@@ -47,7 +47,7 @@ def main() -> None:
         answer = {"urdf": _expand(given), "error": ""}
     except Exception as error:
         answer = {"urdf": "", "error": _error_text(error)}
-    data = memoryview(json.dumps(answer).encode())
+    data = json.dumps(answer).encode()
     while data:
         data = data[os.write(answers, data) :]
     os._exit(0)
@@ -66,13 +66,12 @@ def _expand(given: dict[str, Any]) -> str:
     from graspd.service.store.mesh_files import match_name
 
     texts: dict[str, str] = given["texts"]
-    names: list[str] = given["names"]
 
     def named(path: str) -> str:
         inside = posixpath.normpath(posixpath.join(_TOP, path.replace("\\", "/")))
         if not inside.startswith(_TOP + "/"):
-            said = path.removeprefix(_TOP + "/")
-            raise Refused(f"{said!r} lies outside the hand's folder; put it inside, or give the folder that holds both")
+            name = path.removeprefix(_TOP + "/")
+            raise Refused(f"{name!r} lies outside the hand's folder; put it inside, or give the folder that holds both")
         return inside.removeprefix(_TOP + "/")
 
     def text_of(path: str) -> str:
@@ -88,7 +87,7 @@ def _expand(given: dict[str, Any]) -> str:
         return safe.parseString(text_of(str(filename)) if source is None else source)
 
     def find(package: str) -> str:
-        folder = _package(package, names, texts)
+        folder = _package(package, given["names"], texts)
         if folder is None:
             raise Refused(f"needs the package {package!r}; give the folder that holds both: --urdf NAME")
         return posixpath.join(_TOP, folder)
@@ -97,7 +96,7 @@ def _expand(given: dict[str, Any]) -> str:
         raise Refused(f"asks for the environment variable {name!r}; write its value out")
 
     def evaluate(expression: str, symbols: dict[str, Any], scope: Any = None) -> Any:
-        # The table itself is changed: a copy would lack the enclosing scopes.
+        # `symbols` itself is changed: a copy would lack the enclosing scopes.
         symbols.update(__builtins__={})
         return eval(_checked(expression), symbols, scope)
 
@@ -117,9 +116,8 @@ def _expand(given: dict[str, Any]) -> str:
     xacro.verbosity = 0
     del encodings, yaml
     _restrict_process(given["cpu"], given["memory"])
-    document: minidom.Document = xacro.process_file(
-        f"{_TOP}/{given['main']}", mappings=dict(given["arguments"]), verbosity=0
-    )
+    main, arguments = f"{_TOP}/{given['main']}", dict(given["arguments"])
+    document: minidom.Document = xacro.process_file(main, mappings=arguments, verbosity=0)
     for mesh in document.getElementsByTagName("mesh"):
         if (filename := mesh.getAttribute("filename")).startswith(_TOP + "/"):
             # From `$(find PACKAGE)`: a path in this process, not a file on this machine.
@@ -134,16 +132,14 @@ def _expand(given: dict[str, Any]) -> str:
     return text
 
 
-_PLAIN: Final[dict[str, Any]] = {
-    "true": True,
-    "false": False,
-    "True": True,
-    "False": False,
-    **{kind.__name__: kind for kind in (list, dict, map, str, float, int)},
+#: Names that any expression may use.
+_PLAIN: Final[dict[str, Any]] = {"true": True, "false": False, "True": True, "False": False} | {
+    kind.__name__: kind for kind in (list, dict, map, str, float, int)
 }
 
 
 def _checked(expression: str) -> Any:
+    """Compile an expression; raise Refused if it has forbidden names or more than `_MAX_NODES` nodes."""
     tree = ast.parse(expression.strip(), "<expression>", "eval")
     for count, node in enumerate(ast.walk(tree)):
         name = getattr(node, "attr", None) or getattr(node, "id", None) or ""

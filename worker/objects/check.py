@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from graspd.service.model.errors import AssetError, InputError
+from graspd.service.model.errors import InputError
 from graspd.service.model.object_options import ObjectOptions
 from graspd.worker.objects.options import parse_options
 from graspd.worker.objects.prepare import apply_options, build_model, main_file, repaired_mesh
@@ -33,8 +33,7 @@ def check_object(
         mesh = repaired_mesh(main, files[main], settings)
         facts = _facts(mesh, face_error_m, settings)
     except InputError as error:
-        facts = error.facts if isinstance(error, AssetError) else {}
-        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": facts}
+        return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": getattr(error, "facts", {})}
     size = " x ".join(f"{1e3 * extent:.0f}" for extent in facts["extents_m"])
     parts = [
         f"{name}: {size} mm, {facts['faces']} faces, {1e6 * facts['volume_m3']:.1f} cm3, {facts['mass_kg']:.3g} kg"

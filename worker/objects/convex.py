@@ -32,9 +32,9 @@ class WorkLimitExceeded(Exception):
 
 def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any], cpu_s: int) -> tuple[Floats, ...]:
     """Compute corners (V, 3) of convex pieces by `coacd.run_coacd` with `options`; none if it fails.
-    CoACD holds the interpreter lock, so it runs in a child and delays no heartbeat. The limit is one of CPU time [s]: a
-    busy machine gives the same pieces as an idle one. Raises WorkLimitExceeded: CoACD needs more CPU time. OSError:
-    CoACD could not start or was killed; without this error, the object would silently get another shape."""
+    CoACD holds the interpreter lock, so it runs in a child process and delays no heartbeat. `cpu_s` limits CPU time, so
+    that a busy machine gives the same pieces as an idle one. Raises WorkLimitExceeded: CoACD needs more CPU time.
+    OSError: CoACD could not start or was killed; without this error, the object would silently get another shape."""
     given = io.BytesIO()
     np.savez(given, vertices=vertices, faces=faces, options=np.array(json.dumps(dict(options))))
     command = [sys.executable, "-m", "graspd.worker.objects.convex", str(cpu_s)]

@@ -53,7 +53,7 @@ def cached_arrays(
 @contextmanager
 def caching_steps(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Iterator[None]:
     """Cache the results of `cached_step` inside this context in one entry, and load them the next time.
-    Use it for small steps that need a library that is slow to load. The terms only distinguish entries."""
+    Only small steps that need a slowly loading library gain by this. The terms only distinguish entries."""
     file = _file(kind, terms, code)
     known = _read(file) or {}
     now = dict(known)
@@ -84,7 +84,7 @@ def cached_step(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Seq
 
 
 def _file(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Path:
-    address = digest_json([*terms, _revision(tuple(str(module.__file__) for module in code))])
+    address = digest_json([*terms, revision(tuple(str(module.__file__) for module in code), _LIBRARIES)])
     return user_cache.cache_folder(kind) / f"{address}.npz"
 
 
@@ -105,12 +105,10 @@ def _write(file: Path, arrays: Arrays) -> None:
 
 
 @lru_cache(maxsize=16)
-def _revision(files: tuple[str, ...]) -> str:
+def revision(files: tuple[str, ...], libraries: tuple[str, ...]) -> str:
     """Compute a digest of source files, libraries, and the processor type, which may affect the last bits."""
-    whole = hashlib.sha256()
-    for file in files:
-        whole.update(Path(file).read_bytes())
-    return digest_json([whole.hexdigest(), *map(version_of, _LIBRARIES), platform.machine()])
+    whole = hashlib.sha256(b"".join(Path(file).read_bytes() for file in files))
+    return digest_json([whole.hexdigest(), *map(version_of, libraries), platform.machine()])
 
 
 #: A model's name does not affect its content.
@@ -151,8 +149,8 @@ def _parts(value: Any) -> Iterator[bytes]:
         yield f"{type(value).__name__}{len(value)}".encode()
         for held in sorted(value) if isinstance(value, frozenset) else value:
             yield from _parts(held)
-    elif is_dataclass(value) and isinstance(told := getattr(value, "content", None), str):
-        yield told.encode()
+    elif is_dataclass(value) and isinstance(digest := getattr(value, "content", None), str):
+        yield digest.encode()
     elif is_dataclass(value) and not isinstance(value, type):
         yield from _parts(_digest_fields(value))
     elif isinstance(value, (str, int, float, np.generic)) or value is None:

@@ -18,8 +18,8 @@ _MAX_VERTICES = 30_000
 
 class MeshDistance:
     """Exact distances to one mesh.
-    Its triangles are cut into pieces no longer than a fixed length. The best triangle of the nearest pieces gives a
-    distance. This distance is exact if the centre of the next piece is farther away by more than a piece's radius."""
+    The triangles are cut into pieces no longer than a fixed length. The best triangle of the nearest pieces gives a
+    distance. This distance is exact if the next piece's centre is farther away by more than a piece's radius."""
 
     def __init__(self, vertices: Floats, faces: Indices) -> None:
         from scipy.spatial import cKDTree
@@ -62,8 +62,7 @@ def subdivide_triangles(corners: Floats, factor: float, count: int) -> tuple[Flo
     a, b, c = np.moveaxis(corners, 1, 0)
     area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
     length = factor * np.sqrt(area / count)
-    done: list[Floats] = []
-    owners: list[NDArray[np.int64]] = []
+    done, owners = list[Floats](), list[NDArray[np.int64]]()
     face = np.arange(len(corners), dtype=np.int64)
     while len(corners):
         sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
@@ -83,18 +82,14 @@ def subdivide_triangles(corners: Floats, factor: float, count: int) -> tuple[Flo
 
 def deviation(one: tuple[Floats, Indices], two: tuple[Floats, Indices], samples: int = 8000) -> float:
     """Compute the largest distance [m] of two surfaces, both ways, over vertices and even samples."""
-    furthest = 0.0
-    for source, target in ((one, two), (two, one)):
-        points = surface_points(*source, samples)
-        furthest = max(furthest, MeshDistance(*target).largest(points))
-    return furthest
+    pairs = ((one, two), (two, one))
+    return max(MeshDistance(*target).largest(surface_points(*source, samples)) for source, target in pairs)
 
 
 def surface_points(vertices: Floats, faces: Indices, samples: int) -> Floats:
     """Return points to compare surfaces: vertices (every n-th if there are very many) and even samples."""
-    return np.concatenate(
-        [vertices[:: max(1, len(vertices) // _MAX_VERTICES)], sample_faces(vertices, faces, samples)[0]]
-    )
+    step = max(1, len(vertices) // _MAX_VERTICES)
+    return np.concatenate([vertices[::step], sample_faces(vertices, faces, samples)[0]])
 
 
 def sample_faces(vertices: Floats, faces: Indices, count: int, seed: int = 0) -> tuple[Floats, NDArray[np.int64]]:

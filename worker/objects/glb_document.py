@@ -44,16 +44,15 @@ class Document:
         unique, index = np.unique(corners, axis=0, return_inverse=True)
         padded = np.zeros((len(unique), 4), np.int8)
         padded[:, :3] = unique[:, 1:4]
+        quantised: Any = {"byteStride": 4}, {"normalized": True}
         attributes = {
             "POSITION": self.add_vectors(vertices[unique[:, 0]]),
-            "NORMAL": self._accessor(padded, _BYTE, "VEC3", _ARRAY, {"byteStride": 4}, {"normalized": True}),
+            "NORMAL": self._accessor(padded, _BYTE, "VEC3", _ARRAY, *quantised),
         }
         if face_colours is not None:
             tinted = np.zeros((len(unique), 4), np.uint8)
             tinted[:, :3] = unique[:, 4:]
-            attributes["COLOR_0"] = self._accessor(
-                tinted, _UBYTE, "VEC3", _ARRAY, {"byteStride": 4}, {"normalized": True}
-            )
+            attributes["COLOR_0"] = self._accessor(tinted, _UBYTE, "VEC3", _ARRAY, *quantised)
         indices = self._accessor(index.reshape(-1).astype(np.uint32), _U32, "SCALAR", _ELEMENTS, {}, {})
         primitive: dict[str, Any] = {"attributes": attributes, "indices": indices}
         return primitive if colour is None else primitive | {"material": self._material(colour)}

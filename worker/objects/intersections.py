@@ -34,8 +34,8 @@ _CHUNK: Final = 200_000
 
 def intersecting_faces(vertices: Floats, faces: Indices) -> Indices | None:
     """Find pairs (P, 2) of intersecting faces without common vertex; None if the mesh is too large.
-    The broad phase cuts faces into small pieces, and keeps faces whose pieces' balls and whose boxes overlap. The
-    narrow phase keeps pairs in which an edge of one face passes through the interior of the other."""
+    The broad phase cuts faces into small pieces, and keeps faces with overlapping boxes and bounding balls of pieces.
+    The narrow phase keeps pairs in which an edge of one face passes through the interior of the other."""
     from scipy.spatial import cKDTree
 
     if len(faces) > MAX_FACES:
@@ -69,11 +69,7 @@ def _distinct(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
 def _boxes_meet(corners: Floats, pairs: Indices) -> NDArray[np.bool_]:
     low, high = corners.min(axis=1), corners.max(axis=1)
     one, other = pairs.T
-    meet = np.ones(len(pairs), dtype=bool)
-    for axis in range(3):
-        start, end = low[:, axis], high[:, axis]
-        meet &= (start[one] <= end[other]) & (start[other] <= end[one])
-    return meet
+    return np.asarray(((low[one] <= high[other]) & (low[other] <= high[one])).all(axis=1))
 
 
 def _edges_pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_]:

@@ -51,12 +51,11 @@ def signed_volume(vertices: Floats, faces: FaceIndices) -> float:
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
 
-#: Faces that meet at a larger angle [deg] keep their own normals. Averaging over an edge rounds a cylinder's rim by
-#: millimetres, the largest single effect on grasp quality.
+#: Faces that meet at a larger angle [deg] keep their own normals: averaged ones round a cylinder's rim by millimetres.
 CREASE_DEG = 40.0
 
 
-def corner_normals(vertices: Floats, faces: Ints, crease_deg: float = CREASE_DEG) -> Floats:
+def corner_normals(vertices: Floats, faces: Ints) -> Floats:
     """Compute a unit normal for each corner of each face (F, 3, 3).
     The normal of a corner is the mean normal of the faces at its vertex, weighted by their angle there. Only faces
     inclined to the corner's own face by less than the crease angle count."""
@@ -70,7 +69,7 @@ def corner_normals(vertices: Floats, faces: Ints, crease_deg: float = CREASE_DEG
     incidence = csr_matrix((np.ones(count), (np.arange(count), faces.reshape(-1))), shape=(count, len(vertices)))
     pairs = (incidence @ incidence.T).tocoo()
     near = np.einsum("ij,ij->i", face_normals[face_of[pairs.row]], face_normals[face_of[pairs.col]])
-    keep = near > np.cos(np.deg2rad(crease_deg))
+    keep = near > np.cos(np.deg2rad(CREASE_DEG))
     row, column = pairs.row[keep], pairs.col[keep]
     weights = csr_matrix((angles[column], (row, face_of[column])), shape=(count, len(faces)))
     normals = weights @ face_normals
@@ -89,10 +88,8 @@ def _corner_angles(corners: Floats) -> Floats:
     """Compute the angle (F, 3) of each triangle (F, 3, 3) at each corner [rad]."""
     out = np.roll(corners, -1, axis=1) - corners
     back = np.roll(corners, 1, axis=1) - corners
-    cosine = np.einsum("ijk,ijk->ij", out, back) / np.maximum(
-        np.linalg.norm(out, axis=2) * np.linalg.norm(back, axis=2), 1e-300
-    )
-    return np.arccos(np.clip(cosine, -1, 1))
+    lengths = np.maximum(np.linalg.norm(out, axis=2) * np.linalg.norm(back, axis=2), 1e-300)
+    return np.arccos(np.clip(np.einsum("ijk,ijk->ij", out, back) / lengths, -1, 1))
 
 
 #: Tolerance of a gap's bound, as a share of the bound, since coordinates of files are rounded.
@@ -101,13 +98,9 @@ _ROUNDING: Final = 1e-3
 
 def to_manifold(vertices: Floats, faces: Indices) -> Any | None:
     """Convert the mesh to a manifold3d solid; None if it is no oriented 2-manifold."""
-    mesh = manifold3d.Mesh64(
-        np.array(vertices, dtype=np.float64, order="C"), np.array(faces, dtype=np.uint64, order="C")
-    )
-    solid = manifold3d.Manifold(mesh)
-    if solid.status() != manifold3d.Error.NoError or solid.is_empty():
-        return None
-    return solid
+    corners, triangles = np.array(vertices, np.float64, order="C"), np.array(faces, np.uint64, order="C")
+    solid = manifold3d.Manifold(manifold3d.Mesh64(corners, triangles))
+    return None if solid.status() != manifold3d.Error.NoError or solid.is_empty() else solid
 
 
 def from_manifold(solid: Any) -> tuple[Floats, Indices]:
@@ -117,8 +110,7 @@ def from_manifold(solid: Any) -> tuple[Floats, Indices]:
 
 def unite(parts: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices]]) -> Any:
     """Unite closed outward meshes and subtract the holes (outward too).
-    A part inside a hole does not belong to the solid around the hole, so it stays. A part without thickness adds
-    nothing."""
+    A part inside a hole is separate from the solid around the hole, and stays. A part without thickness is ignored."""
     solids, cuts = ([solid for mesh in side if (solid := to_manifold(*mesh)) is not None] for side in (parts, holes))
     loose = [solid for solid in solids if any((solid - cut).is_empty() for cut in cuts)]
     result = union([solid for solid in solids if not any(solid is one for one in loose)])
@@ -147,7 +139,7 @@ def group_solids(pieces: list[Any], gap: float) -> list[list[Any]]:
 
 
 def _nested(a: Any, b: Any) -> bool:
-    """Check whether one of two outer shells contains the other, which then lies loose in a cavity."""
+    """Check whether one of two outer shells contains the other shell, loose in a cavity."""
     small, large = sorted((a, b), key=lambda one: float(one.volume()))
     return bool((small - large).is_empty())
 
@@ -156,8 +148,7 @@ def _box_separation(low: Floats, high: Floats, i: int) -> Floats:
     return np.asarray(np.linalg.norm(np.maximum(0, np.maximum(low[i] - high[i + 1 :], low[i + 1 :] - high[i])), axis=1))
 
 
-#: Number of digits of the longest extent to which coordinates are rounded, so that no sliver collapses. Least number
-#: of digits for a mesh of decimal coordinates.
+#: Digits of the longest extent to which coordinates are rounded; least number of digits of decimal coordinates.
 DIGITS: Final = 9
 LEAST_DIGITS: Final = 5
 
@@ -166,17 +157,14 @@ LEAST_DIGITS: Final = 5
 class CentredMesh:
     """Points of a mesh relative to the middle of their bounding box, in the units of its file."""
 
-    points: Floats
-    """(V, 3)"""
-    centre: Floats
-    """(3,) the middle in the file's frame."""
-    resolution: float
-    """Spacing of the file's numbers at the mesh's position."""
+    points: Floats  # (V, 3)
+    centre: Floats  # (3,) the middle in the file's frame
+    resolution: float  # spacing of the file's numbers at the mesh's position
 
 
 def centre_points(points: Floats) -> CentredMesh:
     """Centre points (V, 3), rounded so that they do not depend on the origin.
-    If all coordinates are decimals within the precision of the file's numbers, they become these decimals. A mesh of
+    Coordinates that are all decimals within the precision of the file's numbers become these decimals. A mesh of
     decimals is then identical at every distance that the numbers resolve."""
     low, extent = points.min(axis=0), float(np.ptp(points, axis=0).max())
     farthest = np.abs(points).max()

@@ -23,34 +23,22 @@ Ints = NDArray[np.int32]
 class ObjectModel:
     name: str
     digest: str
-    vertices: Floats
-    """(V, 3) [m]"""
-    faces: Ints
-    """(F, 3) counter-clockwise from outside."""
+    vertices: Floats  # (V, 3) [m]
+    faces: Ints  # (F, 3) counter-clockwise from outside
     corner_normals: Floats
     """(F, 3, 3) unit normals per face corner, averaged over faces that meet below the crease angle."""
-    volume: float
-    """[m^3]"""
-    centre_of_mass: Floats
-    """(3,) at uniform density [m]."""
-    inertia: Floats
-    """(3, 3) about the centre of mass, per unit of mass [m^2]."""
-    radius: float
-    """Largest distance of a vertex from the centre of mass [m]."""
-    hull_vertices: Floats
-    """(H, 3) corners of the convex hull [m]."""
-    hull_faces: Ints
-    """(G, 3) outward."""
+    volume: float  # [m^3]
+    centre_of_mass: Floats  # (3,) at uniform density [m]
+    inertia: Floats  # (3, 3) about the centre of mass, per unit of mass [m^2]
+    radius: float  # largest distance of a vertex from the centre of mass [m]
+    hull_vertices: Floats  # (H, 3) corners of the convex hull [m]
+    hull_faces: Ints  # (G, 3) outward
     watertight: bool = True
-    deviation_m: float = 0.0
-    """Largest distance between the prepared surface and the uploaded one [m]."""
+    deviation_m: float = 0.0  # largest distance between the prepared surface and the uploaded one [m]
     repairs: tuple[str, ...] = ()
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Middle of the mesh [m]; zero for a model that is `centred`."""
-    mass: float = field(default=MASS_KG, metadata=TOLD_IF_SET)
-    """[kg]"""
-    friction: float = field(default=FRICTION, metadata=TOLD_IF_SET)
-    """Coulomb coefficient of its contacts in simulation."""
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # middle of the mesh [m]; zero for a model that is `centred`
+    mass: float = field(default=MASS_KG, metadata=TOLD_IF_SET)  # [kg]
+    friction: float = field(default=FRICTION, metadata=TOLD_IF_SET)  # Coulomb coefficient of its contacts in simulation
     about_centre: Floats | None = field(default=None, repr=False)
     """(V + H + 1, 3) vertices, hull and centre of mass relative to the middle [m]; None if centred."""
 
@@ -62,24 +50,15 @@ class ObjectModel:
     @property
     def centred(self) -> ObjectModel:
         """The object in a frame at its middle: the same bits for any origin of the file."""
-        if self.about_centre is None:
-            return self
-        count = len(self.vertices)
-        vertices, hull, mass = self.about_centre[:count], self.about_centre[count:-1], self.about_centre[-1]
-        return self._in_frame(vertices, hull, mass, (0.0, 0.0, 0.0), None)
+        return self if self.about_centre is None else self._with_points(self.about_centre, (0.0, 0.0, 0.0), None)
 
     def place_at(self, centre: tuple[float, float, float]) -> ObjectModel:
         """Return a centred object in a frame in which the object's middle is at `centre` [m]."""
-        if not any(centre):
-            return self
-        held = np.concatenate([self.vertices, self.hull_vertices, self.centre_of_mass[None]])
-        return self._in_frame(
-            self.vertices + centre, self.hull_vertices + centre, self.centre_of_mass + centre, centre, held
-        )
+        points = np.concatenate([self.vertices, self.hull_vertices, self.centre_of_mass[None]])
+        return self._with_points(points + centre, centre, points) if any(centre) else self
 
-    def _in_frame(
-        self, vertices: Floats, hull: Floats, mass: Floats, centre: tuple[float, float, float], held: Floats | None
-    ) -> ObjectModel:
+    def _with_points(self, points: Floats, centre: tuple[float, float, float], held: Floats | None) -> ObjectModel:
+        vertices, hull, mass = points[: len(self.vertices)], points[len(self.vertices) : -1], points[-1]
         return replace(
             self, vertices=vertices, hull_vertices=hull, centre_of_mass=mass, centre=centre, about_centre=held
         )

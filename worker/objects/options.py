@@ -16,7 +16,6 @@ from graspd.worker.objects.model import ObjectModel
 
 #: Keys for mass and friction, which do not affect the shape.
 OF_MATTER: Final = ("density", "mass", "friction")
-
 #: Metres per unit.
 UNITS: Final = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 
@@ -46,7 +45,7 @@ def stated_options(files: Mapping[str, bytes], error: type[AssetError]) -> dict[
 
 
 def apply_request(obj: ObjectModel, request: JobOptions) -> ObjectModel:
-    """Return the object with the job's mass and friction; at level dexgraspbench, with the protocol's.
+    """Return the object with a job's mass and friction; those of the protocol at level dexgraspbench.
     Raises MeshError: the mass would exceed 100 kg."""
     if request.validation == "dexgraspbench":
         return obj.for_dexgraspbench

@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 import math
-import platform
 import zipfile
 from collections.abc import Mapping
 from contextlib import suppress
@@ -20,12 +19,11 @@ import numpy as np
 from graspd.service import user_cache
 from graspd.service.model.digests import digest_files, digest_json, digest_variant
 from graspd.service.model.errors import MeshError, NotFoundError, did_you_mean
-from graspd.service.model.libraries import version_of
 from graspd.service.model.object_options import ObjectOptions
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats
 from graspd.service.store.assets import builtin_files, builtin_names, unpack_file
-from graspd.worker.objects import mesh_geometry, topology
+from graspd.worker.objects import disk_cache, mesh_geometry, topology
 from graspd.worker.objects.distance import MeshDistance, deviation, surface_points
 from graspd.worker.objects.formats import READERS, read_mesh
 from graspd.worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
@@ -34,7 +32,7 @@ from graspd.worker.objects.options import OF_MATTER, parse_options
 from graspd.worker.objects.repair import RepairedMesh, repair
 from graspd.worker.objects.topology import Indices
 
-#: Generic file names. Objects with such files are named by their folders.
+#: Generic file names.
 PLAIN_STEMS: Final = ("clean", "mesh", "model", "textured", "nontextured", "simplified")
 #: Libraries that affect a prepared object.
 _LIBRARIES: Final = ("numpy", "scipy", "manifold3d", "fast-simplification")
@@ -43,9 +41,8 @@ _LIBRARIES: Final = ("numpy", "scipy", "manifold3d", "fast-simplification")
 def load_object(
     files: Mapping[str, bytes], *, name: str, digest: str, face_error_m: float, options: Mapping[str, Any] | None = None
 ) -> ObjectModel:
-    """Load the object in `files`: a mesh (STL, OBJ, PLY, OFF, GLB or DAE) and optionally `asset.json` (see
-    `ObjectOptions`).
-    `digest` is that of the files; `options` are keys that override those of `asset.json`. The prepared surface lies
+    """Load the object in `files`: a mesh (STL, OBJ, PLY, OFF, GLB or DAE), and optionally `asset.json`.
+    `digest` is that of the files; `options` override keys of `asset.json` (`ObjectOptions`). The prepared surface lies
     within `face_error_m` of the uploaded one [m]; 0 keeps all faces. Raises MeshError: the mesh cannot be used; the
     message names the fault and the fix."""
     settings = parse_options(files, options)
@@ -60,6 +57,7 @@ def apply_options(model: ObjectModel, options: ObjectOptions) -> ObjectModel:
 
 
 def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
+    """Return the name of the mesh file: from the options, else the only one; MeshError if there is none."""
     if options.file:
         if options.file not in files:
             raise MeshError(f"asset.json names the file {options.file!r}, which is missing")
@@ -102,16 +100,16 @@ def _repaired(main: str, data: bytes, options_json: str) -> RepairedMesh:
 
 
 def build_model(mesh: RepairedMesh, face_error_m: float) -> ObjectModel:
-    vertices, faces, error = simplify(mesh.vertices, mesh.faces, face_error_m, closed=mesh.watertight)
-    hull_vertices, hull_faces = convex_hull(vertices)
-    solid = (vertices, faces.astype(np.int32)) if mesh.watertight else (hull_vertices, hull_faces)
-    mass = mass_properties(*solid)
+    """Simplify a repaired mesh, and compute its normals, hull and mass properties."""
+    vertices, indices, error = simplify(mesh.vertices, mesh.faces, face_error_m, closed=mesh.watertight)
+    faces, (hull_vertices, hull_faces) = indices.astype(np.int32), convex_hull(vertices)
+    mass = mass_properties(*((vertices, faces) if mesh.watertight else (hull_vertices, hull_faces)))
     middle = ObjectModel(
         name="",
         digest="",
         vertices=vertices,
-        faces=faces.astype(np.int32),
-        corner_normals=corner_normals(vertices, faces.astype(np.int32)),
+        faces=faces,
+        corner_normals=corner_normals(vertices, faces),
         volume=mass.volume,
         centre_of_mass=mass.centre_of_mass,
         inertia=mass.inertia,
@@ -141,17 +139,14 @@ def object_from_path(
     """Load an object for the command line: name of a built-in, a mesh file, or a ZIP.
     Raises NotFoundError: neither a file nor a built-in object. MeshError: see `load_object`."""
     name, files, stated = files_from_path(path)
+    digest = digest_variant(digest_files(AssetKind.OBJECT, files), options)
     return load_object(
-        files,
-        name=name,
-        digest=digest_variant(digest_files(AssetKind.OBJECT, files), options),
-        face_error_m=face_error_m,
-        options={**stated, **(options or {})},
+        files, name=name, digest=digest, face_error_m=face_error_m, options={**stated, **(options or {})}
     )
 
 
 def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, Any]]:
-    """Return name, files and further options of the object at `path`."""
+    """Return name, files and options of an object: a mesh file, a ZIP, or a built-in's name."""
     path = Path(path)
     if not path.is_file():
         if str(path) in builtin_names(AssetKind.OBJECT):
@@ -161,27 +156,21 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
         raise NotFoundError(f"{path} is neither a file nor a built-in object ({', '.join(known)}){meant}")
     if path.suffix.lower() == ".zip":
         return path.stem, unpack_file(path), {}
-    files = {path.name: path.read_bytes()}
-    beside = path.parent / "asset.json"
-    if beside.is_file():
-        files["asset.json"] = beside.read_bytes()
-        return name_of(path), files, {"file": path.name}
-    return name_of(path), files, {}
+    files, beside = {path.name: path.read_bytes()}, path.with_name("asset.json")
+    if not beside.is_file():
+        return name_of(path), files, {}
+    return name_of(path), files | {beside.name: beside.read_bytes()}, {"file": path.name}
 
 
 def name_of(path: Path) -> str:
-    """Return the object's name: that of its mesh file, or of the folder if the file name is generic."""
+    """Return an object's name: that of its mesh file, or of the folder if the file name is generic."""
     return path.resolve().parent.name if path.stem.lower() in PLAIN_STEMS else path.stem
 
 
 @lru_cache(maxsize=1)
 def revision() -> str:
-    """Compute a digest of this package's source, its libraries, and the processor type.
-    A change of the preparation thus invalidates cached objects. The last bits may depend on the processor."""
-    whole = hashlib.sha256()
-    for file in sorted(Path(__file__).parent.rglob("*.py")):
-        whole.update(file.read_bytes())
-    return digest_json([whole.hexdigest(), *map(version_of, _LIBRARIES), platform.machine()])
+    """Compute a digest of this package and its libraries, so that a change invalidates cached objects."""
+    return disk_cache.revision(tuple(map(str, sorted(Path(__file__).parent.rglob("*.py")))), _LIBRARIES)
 
 
 Mesh = tuple[Floats, Indices]
@@ -192,8 +181,7 @@ FEW_FACES: Final = 64
 MANY_FACES: Final = 40_000
 #: The search ends when its bounds on the number of faces differ by less than this factor.
 STEP: Final = 1.12
-#: Number of surface samples, besides the vertices, at which a simplified mesh is compared with the original, and its
-#: largest deviation there as a share of the bound.
+#: Comparison of a trial: number of surface samples besides the vertices, and largest deviation as a share of the bound.
 SAMPLES: Final = 4000
 MARGIN: Final = 0.9
 #: Number of samples at which the deviation of the returned mesh is measured.
@@ -204,17 +192,15 @@ PATIENCE: Final = 3
 
 def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool = True) -> tuple[Floats, Indices, float]:
     """Find the coarsest mesh whose surface lies within `error_m` of the given one, both ways.
-    Quadric edge collapse (Garland & Heckbert 1997) reduces the mesh; bisection finds the number of faces. Each trial is
-    measured. A trial of a closed mesh must be an oriented 2-manifold with as many shells as the original. If none
-    passes for a closed mesh, manifold3d's edge collapse is used. If that gains nothing, the mesh stays unchanged.
-    Return vertices, faces and the measured deviation [m]."""
+    Quadric edge collapse (Garland & Heckbert 1997) reduces the mesh; bisection finds the number of faces. A trial of a
+    closed mesh must be an oriented 2-manifold with as many shells as the original. If no trial of a closed mesh passes,
+    manifold3d's edge collapse is used. Return vertices, faces and the measured deviation [m]."""
     if error_m <= 0 or len(faces) <= FEW_FACES:
         return vertices, faces, 0.0
     limit = MARGIN * error_m
     original = ReferenceMesh(vertices, faces, closed)
     if len(faces) > MANY_FACES:
-        # A mesh within a fifth of the error is quick to compare with. By the triangle inequality, four fifths remain
-        # for the trials.
+        # A mesh within a fifth of the error is quick to compare with: four fifths remain for the trials.
         start = _simplified(original, MANY_FACES, limit / 5)
         if start is not None:
             original, limit = ReferenceMesh(*start, closed), limit * 4 / 5
@@ -222,12 +208,11 @@ def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool =
     low, high = float(FEW_FACES), float(len(original.faces))
     while high / low > STEP:
         target = round(math.sqrt(low * high))
-        rollout = _simplified(original, target, limit)
-        if rollout is None:
+        if (trial := _simplified(original, target, limit)) is None:
             low = target
         else:
             high = target
-            accepted.append(rollout)
+            accepted.append(trial)
     if not accepted and closed:
         accepted = _thin_variants(original, limit)
     for mesh in reversed(accepted):
@@ -247,10 +232,8 @@ class ReferenceMesh:
         self._points = surface_points(vertices, faces, SAMPLES)
 
     def accepts(self, mesh: Mesh) -> bool:
-        """Check whether a mesh is as good as a closed original: closed, outward, and in as many shells."""
-        if not self.closed:
-            return True
-        return (
+        """Check whether a mesh is closed, outward, and of as many shells as a closed original."""
+        return not self.closed or (
             topology.is_closed(mesh[1])
             and signed_volume(*mesh) > 0
             and int(topology.components(mesh[1]).max()) == self.shells
@@ -273,9 +256,8 @@ def _simplified(original: ReferenceMesh, target: int, error_m: float) -> Mesh | 
     A collapse that breaks the surface at one number of faces often succeeds at the next, so a few numbers are used."""
     for count in (target, int(target * 1.02) + 2, int(target * 1.05) + 4):
         mesh = _collapse(original.vertices, original.faces, count)
-        if mesh is None or not original.accepts(mesh):
-            continue
-        return mesh if original.is_within(mesh, error_m) else None
+        if mesh is not None and original.accepts(mesh):
+            return mesh if original.is_within(mesh, error_m) else None
     return None
 
 

@@ -35,7 +35,7 @@ MERGE: Final = 1e-8
 WELD: Final = 1e-5
 #: Largest rim of a hole that is filled, as a share of the longest extent.
 HOLE: Final = 0.03
-#: Volume below which components are dropped as scan debris, as a share of the largest one's.
+#: Volume below which components are dropped as scan debris, as a share of the largest component's volume.
 DEBRIS: Final = 1e-6
 #: Spacing of coordinates at the mesh's position above which there is a warning [m].
 COARSE_M: Final = 1e-4
@@ -49,18 +49,14 @@ _SAMPLES: Final = 4000
 class RepairedMesh:
     """Mesh in metres, with a list of changes and a list of accepted anomalies."""
 
-    vertices: Floats
-    """(V, 3) relative to the middle of the mesh."""
+    vertices: Floats  # (V, 3) relative to the middle of the mesh
     faces: Indices
     watertight: bool = True
     repairs: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    self_intersections: int | None = None
-    """Pairs of faces that still intersect; None if not checked."""
-    moved_m: float = 0.0
-    """Largest distance of the repaired surface from the original [m]."""
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """The middle in the file's frame [m]."""
+    self_intersections: int | None = None  # pairs of faces that still intersect; None if not checked
+    moved_m: float = 0.0  # largest distance of the repaired surface from the original [m]
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the middle in the file's frame [m]
 
     def with_faces(self, vertices: Floats, faces: Indices, repair: str) -> RepairedMesh:
         return replace(self, vertices=vertices, faces=faces, repairs=(*self.repairs, repair))
@@ -145,24 +141,19 @@ def _clean(mesh: RepairedMesh) -> RepairedMesh:
     """Merge vertices; drop duplicates and faces without area."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     vertices, faces = topology.merge_vertices(mesh.vertices, mesh.faces, MERGE * extent)
-    collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    faces = faces[~collapsed]
-    doubled = topology.repeated_faces(faces) if len(faces) else np.zeros(0, dtype=bool)
-    faces = faces[~doubled]
-    slivers = topology.degenerate_faces(vertices, faces) if len(faces) else np.zeros(0, dtype=bool)
+    given = len(faces)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    faces = faces[~topology.repeated_faces(faces)] if len(faces) else faces
     # A face without area may join a long edge with two short ones. It is dropped only if no edge opens.
-    if slivers.any() and topology.count_open_edges(faces[~slivers]) <= topology.count_open_edges(faces):
-        faces = faces[~slivers]
-    else:
-        slivers[:] = False
+    wide = faces[~topology.degenerate_faces(vertices, faces)] if len(faces) else faces
+    if topology.count_open_edges(wide) <= topology.count_open_edges(faces):
+        faces = wide
     if not len(faces):
         raise MeshError("the mesh encloses no volume: its faces have no area or cover each other; give it a thickness")
-    mesh = replace(mesh, vertices=vertices, faces=faces)
-    if dropped := int(collapsed.sum() + doubled.sum() + slivers.sum()):
-        mesh = mesh.with_faces(
-            *topology.drop_unused_vertices(vertices, faces), f"dropped {dropped} degenerate or duplicate faces"
-        )
-    return mesh
+    if dropped := given - len(faces):
+        kept = topology.drop_unused_vertices(vertices, faces)
+        return mesh.with_faces(*kept, f"dropped {dropped} degenerate or duplicate faces")
+    return replace(mesh, vertices=vertices, faces=faces)
 
 
 def _close(mesh: RepairedMesh) -> RepairedMesh:
@@ -173,10 +164,9 @@ def _close(mesh: RepairedMesh) -> RepairedMesh:
         return mesh
     if turned := int((faces != mesh.faces).any(axis=1).sum()):
         mesh = mesh.with_faces(mesh.vertices, faces, f"winding of {turned} faces made consistent with their neighbours")
-    crowded = int((topology.edge_faces(mesh.faces)[1] > 2).sum())
-    if crowded:
+    if crowded := int((topology.edge_faces(mesh.faces)[1] > 2).sum()):
         split = topology.part_double_edges(*topology.split_edges(mesh.vertices, mesh.faces))
-        if not topology.count_open_edges(split[1]) > topology.count_open_edges(mesh.faces):
+        if topology.count_open_edges(split[1]) <= topology.count_open_edges(mesh.faces):
             mesh = mesh.with_faces(*split, f"split {crowded} non-manifold edges")
     if topology.count_open_edges(mesh.faces):
         mesh = _fill_pinholes(mesh)
@@ -196,9 +186,8 @@ def _weld(mesh: RepairedMesh) -> RepairedMesh:
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     if not len(faces) or topology.count_open_edges(faces) >= topology.count_open_edges(mesh.faces):
         return mesh
-    return mesh.with_faces(
-        *topology.drop_unused_vertices(mesh.vertices[first], faces), f"welded {len(pairs)} pairs of vertices at a seam"
-    )
+    welded = topology.drop_unused_vertices(mesh.vertices[first], faces)
+    return mesh.with_faces(*welded, f"welded {len(pairs)} pairs of vertices at a seam")
 
 
 def _fill_pinholes(mesh: RepairedMesh) -> RepairedMesh:
@@ -254,13 +243,11 @@ def _resolve_components(mesh: RepairedMesh, options: ObjectOptions) -> RepairedM
     solid_parts = np.abs(volumes) > DEBRIS * abs(volumes[largest])
     if abs(volumes[largest]) < 1e-9 * np.ptp(parts[largest][0], axis=0).max() ** 3:
         raise MeshError("the mesh encloses no volume; give the surface a thickness")
-    if not solid_parts.all():
+    sign = np.sign(volumes[largest])
+    if dropped := int((~solid_parts).sum()):
         parts = [part for part, keep in zip(parts, solid_parts, strict=True) if keep]
         volumes = volumes[solid_parts]
-        largest = int(np.argmax(np.abs(volumes)))
-        dropped = int((~solid_parts).sum())
-        mesh = mesh.with_faces(*_join(parts), f"dropped {dropped} components without volume")
-    sign = np.sign(volumes[largest])
+        mesh = mesh.with_faces(*topology.join_meshes(parts), f"dropped {dropped} components without volume")
     outward = [part if v > 0 else (part[0], part[1][:, ::-1]) for part, v in zip(parts, volumes, strict=True)]
     if len(parts) == 1:
         if sign < 0:
@@ -270,14 +257,9 @@ def _resolve_components(mesh: RepairedMesh, options: ObjectOptions) -> RepairedM
 
 
 def _unite(
-    mesh: RepairedMesh,
-    parts: list[tuple[Floats, Indices]],
-    against: np.ndarray,
-    *,
-    turned: bool,
-    options: ObjectOptions,
+    mesh: RepairedMesh, parts: list[tuple[Floats, Indices]], against: np.ndarray, turned: bool, options: ObjectOptions
 ) -> RepairedMesh:
-    """Unite shells to one solid; shells wound against the largest one are cavities if they lie inside it."""
+    """Unite outward shells to one solid; shells wound `against` the largest one inside it are cavities."""
     if turned:
         mesh = mesh.with_faces(mesh.vertices, mesh.faces[:, ::-1], "winding turned outward")
     boxes = [(p[0].min(axis=0), p[0].max(axis=0)) for p in parts]
@@ -311,10 +293,9 @@ def _unite(
     before = sum(signed_volume(*p) for p in positives) - sum(signed_volume(*p) for p in holes)
     # Parts that only share a face keep their volume when united, but their faces inside the solid are removed.
     if abs(united.volume() - before) > 1e-6 * before or len(pieces) < len(positives):
-        return mesh.with_faces(
-            *mesh_geometry.from_manifold(united), f"united {len(parts)} touching or intersecting components"
-        )
-    vertices, faces = _join(positives + [(corners, cavity[:, ::-1]) for corners, cavity in holes])
+        found = mesh_geometry.from_manifold(united)
+        return mesh.with_faces(*found, f"united {len(parts)} touching or intersecting components")
+    vertices, faces = topology.join_meshes(positives + [(corners, cavity[:, ::-1]) for corners, cavity in holes])
     return replace(mesh, vertices=vertices, faces=faces)
 
 
@@ -329,9 +310,3 @@ def _resolve_self_intersections(mesh: RepairedMesh) -> RepairedMesh:
         return replace(mesh, self_intersections=len(found), notes=(*mesh.notes, note))
     mesh = mesh.with_faces(*united, f"united the mesh with itself where {len(found)} pairs of faces intersected")
     return replace(mesh, self_intersections=0)
-
-
-def _join(parts: list[tuple[Floats, Indices]]) -> tuple[Floats, Indices]:
-    starts = np.cumsum([0] + [len(vertices) for vertices, _ in parts[:-1]])
-    faces = [faces + start for (_, faces), start in zip(parts, starts, strict=True)]
-    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)

@@ -4,6 +4,7 @@ All functions are pure: vertices (V, 3) and faces (F, 3) in, new arrays out."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -62,14 +63,19 @@ def drop_unused_vertices(vertices: Floats, faces: FaceIndices) -> tuple[Floats, 
     return vertices[used], inverse.reshape(-1, 3)
 
 
+def join_meshes(parts: Sequence[tuple[Floats, FaceIndices]]) -> tuple[Floats, Indices]:
+    """Join meshes, given as vertices and faces, in one mesh."""
+    starts = np.cumsum([0] + [len(vertices) for vertices, _ in parts[:-1]])
+    faces = [faces + start for (_, faces), start in zip(parts, starts, strict=True)]
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
+
+
 def degenerate_faces(vertices: Floats, faces: Indices) -> Mask:
-    """Return a mask (F,) of faces that repeat a vertex or are thinner than 1e-6 of their longest side."""
+    """Return a mask (F,) of faces that are thinner than 1e-6 of their longest side."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    sides = np.stack([b - a, c - b, a - c])
-    longest = np.linalg.norm(sides, axis=2).max(axis=0)
-    height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(longest, 1e-300)
-    repeats = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
-    return repeats | (height <= 1e-6 * longest)
+    longest = np.linalg.norm(np.stack([b - a, c - b, a - c]), axis=2).max(axis=0)
+    height = np.linalg.norm(face_vectors(vertices, faces), axis=1) / np.maximum(longest, 1e-300)
+    return np.asarray(height <= 1e-6 * longest)
 
 
 def repeated_faces(faces: Indices) -> Mask:
@@ -102,7 +108,7 @@ def repeated_faces(faces: Indices) -> Mask:
 
 
 def _edge_keys(faces: Indices, *, directed: bool = False) -> Indices:
-    """Encode edges as numbers (3F,) in the order of `directed_edges`; numbers sort far faster than pairs."""
+    """Encode edges (3F,) as numbers in the order of `directed_edges`; numbers sort far faster than pairs."""
     edges = directed_edges(faces)
     edges = edges if directed else np.sort(edges, axis=1)
     return (edges[:, 0] << 32) | edges[:, 1]
@@ -153,16 +159,12 @@ def parts_of_graph(one: Indices, other: Indices, count: int) -> NDArray[np.int32
     from scipy.sparse.csgraph import connected_components
 
     graph = coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count))
-    label: NDArray[np.int32] = connected_components(graph, directed=False)[1]
-    return label
+    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def components(faces: Indices) -> Indices:
     """Return the index (F,) of each face's connected component (by shared vertices)."""
-    n = int(faces.max()) + 1
-    rows = np.concatenate([faces[:, 0], faces[:, 1]])
-    columns = np.concatenate([faces[:, 1], faces[:, 2]])
-    label = parts_of_graph(rows, columns, n)
+    label = parts_of_graph(faces[:, :2].T.ravel(), faces[:, 1:].T.ravel(), int(faces.max()) + 1)
     _, numbers = np.unique(label[faces[:, 0]], return_inverse=True)
     return numbers.reshape(-1).astype(np.int64)
 

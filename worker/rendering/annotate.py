@@ -36,8 +36,7 @@ ALL: Final = "all"
 
 
 def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
-    """Return the channels in fixed order, without duplicates; `all` stands for every channel.
-    Raises InputError: a channel is unknown."""
+    """Return the channels in fixed order; `all` stands for every channel; InputError if one is unknown."""
     wanted = {word.strip() for word in words if word.strip()}
     if unknown := sorted(wanted - {*EXTRA_CHANNELS, ALL}):
         meant = did_you_mean(unknown[0], EXTRA_CHANNELS)
@@ -47,8 +46,7 @@ def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
 
 def occlusion_ratio(segmentation: NDArray[np.uint8], alone: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return the occluded share (V,) of the object's pixels; nan if the object is not in the picture.
-    `segmentation` (V, H, W) labels the scene, `alone` (V, H, W) are the object's pixels in a picture of the object
-    alone."""
+    `segmentation` (V, H, W) labels the scene; `alone` (V, H, W) masks the object in a picture without other solids."""
     whole = alone.sum(axis=(1, 2)).astype(float)
     seen = (alone & (segmentation == OBJECT)).sum(axis=(1, 2))
     return np.where(whole > 0, 1.0 - seen / np.maximum(whole, 1.0), np.nan).astype(np.float32)

@@ -71,7 +71,7 @@ def inscribed_field_of_view(k: Floats, width: int, height: int) -> float:
     if min(slopes) <= 0:
         raise InputError(
             f"the principal point ({k[0, 2]:g}, {k[1, 2]:g}) lies outside the picture of {width} x {height} px, so no "
-            f"camera can be aimed; give the cameras' poses too"
+            "camera can be aimed; give the cameras' poses too"
         )
     return float(2 * np.arctan(min(slopes)))
 
@@ -99,17 +99,15 @@ def sample_hemisphere(
     centre: Floats, radius: float, *, views: int, field_of_view: float, rng: np.random.Generator
 ) -> list[Floats]:
     """Sample extrinsics of cameras on a hemisphere around a ball that fills the field of view [rad].
-    Azimuths are stratified, one per sector of 360 / views degrees. Elevations are uniform in area within
-    `ELEVATION`."""
+    Azimuths are stratified, one per sector of 360 / views degrees; elevations are uniform in area in `ELEVATION`."""
     turn = rng.uniform(0, 2 * np.pi)
     extrinsics = []
     for view in range(views):
         azimuth = turn + 2 * np.pi * (view + rng.uniform(0.1, 0.9)) / views
         elevation = np.arcsin(rng.uniform(np.sin(ELEVATION[0]), np.sin(ELEVATION[1])))
         distance = max(NEAREST_M + radius, distance_to_fill(radius, field_of_view, rng.uniform(*FILL)))
-        direction = np.array(
-            [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-        )
+        flat = np.cos(elevation)
+        direction = np.array([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)])
         aim = centre + radius * AIM_JITTER * rng.uniform(-1, 1, 3)
         extrinsics.append(look_at(centre + distance * direction, aim))
     return extrinsics
@@ -174,7 +172,7 @@ class _File(_Model):
 
 
 def read_cameras(path: Path) -> GivenCameras:
-    """Load cameras from a JSON file. All keys are optional.
+    """Load cameras from a JSON file; all keys are optional.
     `width`, `height` [px]. `intrinsics`: a 3 x 3 matrix or `fx fy cx cy` [px]. `cameras`: a list of `{"extrinsics": 4 x
     4}` (table to camera) or `{"eye": [x, y, z], "target": [x, y, z]}` (table frame [m]). Raises InputError: the file
     cannot be read, or describes no possible camera."""
@@ -210,12 +208,8 @@ def _place(path: Path, number: int, camera: _Camera) -> Floats:
     e = np.asarray(camera.extrinsics, float)
     u, _, v = np.linalg.svd(e[:3, :3])
     rotation = u @ v
-    if (
-        np.abs(rotation - e[:3, :3]).max() > ROTATION_ERROR
-        or np.linalg.det(rotation) < 0
-        or e[3].tolist() != [0, 0, 0, 1]
-    ):
+    error = np.abs(rotation - e[:3, :3]).max()
+    if error > ROTATION_ERROR or np.linalg.det(rotation) < 0 or e[3].tolist() != [0, 0, 0, 1]:
         raise InputError(f"{path}: extrinsics of camera {number} are no rigid motion (rotation, translation; 0 0 0 1)")
-    # The nearest rotation: rounded digits in the file must not distort the picture.
-    e[:3, :3] = rotation
+    e[:3, :3] = rotation  # rounded digits in the file must not distort the picture
     return e

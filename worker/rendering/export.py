@@ -27,7 +27,7 @@ _DISTANCES: Final = {"image/depth": "distance_to_image_plane", "image/distance":
 def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> list[Path]:
     """Write every picture of a views shard under Replicator's BasicWriter file names; return the files.
     Per picture: `rgb_NNNN.png` (8 bits), `semantic_segmentation_NNNN.png` (8 bits, the labels themselves),
-    `view_NNNN.json`, and the depth as `distance_to_image_plane_NNNN.exr` (float32 [m], channel Z, inf for no surface)
+    `view_NNNN.json`; the depth as `distance_to_image_plane_NNNN.exr` (float32 [m], channel Z, inf for no surface)
     or `.png` (16 bits, steps of 0.1 mm, 0 for no surface). If the shard has them: `distance_to_camera_NNNN`,
     `normals_NNNN.exr` (half, X Y Z), `rgb_hand_NNNN.png`. For all pictures: `labels.json`. The folder is created if
     absent. Raises InputError: the folder cannot be written, or has such files already."""
@@ -39,11 +39,11 @@ def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> 
         raise InputError(f"{folder} contains exported views already; give another folder as --output")
     written = [_json(folder / "labels.json", _labels(views))]
     for view in range(len(views["camera/eye"])):
-        written += _one(views, view, folder, depth)
+        written += _export_view(views, view, folder, depth)
     return written
 
 
-def _one(views: Shard, view: int, folder: Path, depth: DepthFormat) -> list[Path]:
+def _export_view(views: Shard, view: int, folder: Path, depth: DepthFormat) -> list[Path]:
     def path(name: str, suffix: str) -> Path:
         return folder / f"{name}_{view:04}.{suffix}"
 
@@ -67,7 +67,7 @@ def describe(views: Shard, view: int) -> dict[str, Any]:
     """Return camera and boxes of one picture; a box is None where the object is not visible."""
     height, width = views["image/rgb"].shape[1:3]
     e = np.asarray(views["camera/extrinsics"][view], float)
-    said: dict[str, Any] = {
+    facts: dict[str, Any] = {
         "scene": int(views["camera/scene_index"][view]),
         "eye": _EYES[int(views["camera/eye"][view])],
         "width": int(width),
@@ -81,10 +81,10 @@ def describe(views: Shard, view: int) -> dict[str, Any]:
     for name in ("bounding_box_2d_tight", "bounding_box_2d_loose", "bounding_box_3d", "occlusion_ratio"):
         if f"box/{name}" in views.arrays:
             value = np.asarray(views[f"box/{name}"][view], float)
-            said[name] = value.tolist() if np.isfinite(value).all() else None
+            facts[name] = value.tolist() if np.isfinite(value).all() else None
     if "camera/hand_grasp" in views.arrays:
-        said["hand_grasp"] = int(views["camera/hand_grasp"][view])
-    return said
+        facts["hand_grasp"] = int(views["camera/hand_grasp"][view])
+    return facts
 
 
 def _labels(views: Shard) -> dict[str, dict[str, str]]:

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import threading
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import accumulate
 from typing import Final
 
 import numpy as np
 from cachetools import LRUCache, cached
 from numpy.typing import NDArray
 
-from graspd.service.model.colours import hexadecimal, linear
+from graspd.service.model.colours import Colour, hexadecimal, linear
 from graspd.service.model.transforms import Floats
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.robot import Ints
-from graspd.worker.hands.visuals import NO_VISUALS, VisualMesh
+from graspd.worker.hands.visuals import NO_VISUALS
 from graspd.worker.objects.mesh_geometry import corner_normals
+from graspd.worker.objects.topology import join_meshes
 from graspd.worker.rendering.scenery import Appearance, Solid
 
 _HAND: Final = Appearance(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)
@@ -67,8 +68,7 @@ def hand_parts(hand: HandModel) -> tuple[MovingSolid, ...]:
 
 def drawn_parts(hand: HandModel, *, mounted: bool) -> tuple[MovingSolid, ...]:
     """Return the drawn solids of a hand; if `mounted`, also those of `hand.mounting` (own body numbers)."""
-    above = hand.mounting if mounted else None
-    return hand_parts(hand) + (() if above is None else hand_parts(above))
+    return hand_parts(hand) + (hand_parts(hand.mounting) if mounted and hand.mounting is not None else ())
 
 
 def drawn_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats, wrist: Floats | None) -> Floats:
@@ -93,17 +93,16 @@ def drawn_bodies(hand: HandModel) -> list[int]:
 def _drawn(hand: HandModel) -> Iterator[MovingSolid]:
     seen = {mesh.body for mesh in hand.visuals.meshes}
     for body in range(hand.bodies):
-        if body not in seen:
-            if pieces := [(piece.vertices, piece.faces) for piece in hand.pieces if piece.body == body]:
-                yield MovingSolid(body, _merge(pieces), _own_look(hand, body))
-            continue
-        of_colour: dict[tuple[float, float, float] | None, list[VisualMesh]] = {}
+        of_colour = defaultdict[Colour | None, list[tuple[Floats, Ints]]](list)
         for mesh in hand.visuals.meshes:
             if mesh.body == body:
-                of_colour.setdefault(mesh.colour, []).append(mesh)
+                of_colour[mesh.colour].append((mesh.vertices, mesh.faces))
+        for piece in hand.pieces:
+            if piece.body == body and body not in seen:
+                of_colour[None].append((piece.vertices, piece.faces))
         for colour, meshes in of_colour.items():
             look = _own_look(hand, body) if colour is None else Appearance(linear(*colour), roughness=0.45)
-            yield MovingSolid(body, _merge([(m.vertices, m.faces) for m in meshes]), look)
+            yield MovingSolid(body, _merge(meshes), look)
 
 
 def _own_look(hand: HandModel, body: int) -> Appearance:
@@ -113,9 +112,5 @@ def _own_look(hand: HandModel, body: int) -> Appearance:
 
 
 def _merge(meshes: list[tuple[Floats, Ints]]) -> Solid:
-    starts = accumulate((len(points) for points, _ in meshes), initial=0)
-    return Solid(
-        np.concatenate([points for points, _ in meshes]),
-        np.concatenate([triangles + start for (_, triangles), start in zip(meshes, starts, strict=False)]),
-        np.concatenate([corner_normals(points, triangles) for points, triangles in meshes]),
-    )
+    points, triangles = join_meshes(meshes)
+    return Solid(points, triangles.astype(np.int32), np.concatenate([corner_normals(*mesh) for mesh in meshes]))

@@ -16,7 +16,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.cameras import Cameras, intrinsics, look_at
-from graspd.worker.rendering.hands import hand_parts
+from graspd.worker.rendering.hands import drawn_bodies, hand_parts
 from graspd.worker.rendering.kernels.shading import CATCHER
 from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Lamp, Solid
 from graspd.worker.rendering.tracer import Tracer
@@ -84,14 +84,10 @@ def _shoot(
     run: ExecutionContext,
 ) -> NDArray[np.uint8]:
     worlds, parts = len(bodies), hand_parts(hand)
-    points = np.concatenate(
-        [np.broadcast_to(obj.hull_vertices, (worlds, *obj.hull_vertices.shape)), hand_points(hand, bodies)], axis=1
-    )
+    points = np.concatenate([np.tile(obj.hull_vertices, (worlds, 1, 1)), hand_points(hand, bodies)], axis=1)
     still = np.stack([[floor_pose(world), IDENTITY_POSE] for world in points])
-    stage.place(
-        np.concatenate([still, bodies[:, [part.body for part in parts]]], axis=1),
-        [[FLOOR, OBJECT_LOOK, *(part.look for part in parts)]] * worlds,
-    )
+    poses = np.concatenate([still, bodies[:, drawn_bodies(hand)]], axis=1)
+    stage.place(poses, [[FLOOR, OBJECT_LOOK, *(part.look for part in parts)]] * worlds)
     k = intrinsics(*size, FIELD_OF_VIEW)
     sides = []
     for azimuth in azimuths:

@@ -19,18 +19,9 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.mesh_geometry import corner_normals, from_manifold
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.rendering import sheets
+from graspd.worker.rendering import pictures, sheets
 from graspd.worker.rendering.cameras import intrinsics
-from graspd.worker.rendering.hands import hand_parts
-from graspd.worker.rendering.pictures import (
-    FIELD_OF_VIEW,
-    FLOOR,
-    FLOOR_SIZE,
-    OBJECT_LOOK,
-    fit_camera,
-    floor_pose,
-    studio_shot,
-)
+from graspd.worker.rendering.hands import drawn_bodies, hand_parts
 from graspd.worker.rendering.scenery import Appearance, Box, Solid
 from graspd.worker.rendering.tracer import Tracer
 
@@ -63,7 +54,7 @@ def hand_portrait(hand: HandModel) -> Image.Image:
     arrow = _arrow(_ARROW_SHARE * extent)
     palm = compose(upright, np.concatenate([hand.palm.centre, _quat_of_z(hand.palm.approach)]))
     points = np.concatenate([*(c.reshape(-1, 3) for c in corners), apply(palm, arrow.vertices)])
-    poses = np.concatenate([bodies[:, [part.body for part in parts]], np.tile(palm, (len(named), 1, 1))], axis=1)
+    poses = np.concatenate([bodies[:, drawn_bodies(hand)], np.tile(palm, (len(named), 1, 1))], axis=1)
     azimuths = np.repeat(_HAND_AZIMUTHS, len(named))
     looks = [*(part.look for part in parts), _ARROW]
     solids = [*(part.solid for part in parts), arrow]
@@ -77,7 +68,7 @@ def object_portrait(obj: ObjectModel) -> Image.Image:
     extents = " x ".join(f"{1e3 * extent:.0f}" for extent in np.ptp(obj.vertices, axis=0))
     captions = [f"{obj.name}, {extents} mm", f"{len(obj.faces)} faces", f"within {1e3 * obj.deviation_m:.2f} mm"]
     poses = np.tile(IDENTITY_POSE, (len(captions), 1, 1))
-    return _page(_shoot([solid], poses, [OBJECT_LOOK], obj.vertices, _OBJECT_AZIMUTHS), captions)
+    return _page(_shoot([solid], poses, [pictures.OBJECT_LOOK], obj.vertices, _OBJECT_AZIMUTHS), captions)
 
 
 def write_png(image: Image.Image, path: Path) -> None:
@@ -93,20 +84,20 @@ def _shoot(
 ) -> NDArray[np.uint8]:
     """Render N worlds (N, H, W, 3), each from its azimuth; every camera frames the same points."""
     worlds = len(poses)
-    stage = Tracer([Box(FLOOR_SIZE), *solids], "cpu")
-    floors = np.tile(floor_pose(points), (worlds, 1, 1))
-    stage.place(np.concatenate([floors, poses], axis=1), [[FLOOR, *looks]] * worlds)
-    k = intrinsics(*SIZE, FIELD_OF_VIEW)
+    stage = Tracer([Box(pictures.FLOOR_SIZE), *solids], "cpu")
+    floors = np.tile(pictures.floor_pose(points), (worlds, 1, 1))
+    stage.place(np.concatenate([floors, poses], axis=1), [[pictures.FLOOR, *looks]] * worlds)
+    k = intrinsics(*SIZE, pictures.FIELD_OF_VIEW)
     angles = np.asarray(azimuths, float)
-    cameras = np.stack([fit_camera(points, angle, k, SIZE) for angle in angles])
-    return stage.shoot(studio_shot(cameras, k, SIZE, angles, _SAMPLES)).rgb
+    cameras = np.stack([pictures.fit_camera(points, angle, k, SIZE) for angle in angles])
+    return stage.shoot(pictures.studio_shot(cameras, k, SIZE, angles, _SAMPLES)).rgb
 
 
-def _page(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
+def _page(shown: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
     width, height = SIZE[0], SIZE[1] + _CAPTION
-    page = Image.new("RGB", (_COLUMNS * width, len(pictures) // _COLUMNS * height), sheets.PAPER)
+    page = Image.new("RGB", (_COLUMNS * width, len(shown) // _COLUMNS * height), sheets.PAPER)
     draw = ImageDraw.Draw(page)
-    for number, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
+    for number, (picture, caption) in enumerate(zip(shown, captions, strict=True)):
         row, column = divmod(number, _COLUMNS)
         page.paste(Image.fromarray(picture), (column * width, row * height))
         sheets.draw_text(draw, (column * width + 12, row * height + SIZE[1] + 21), caption, 15, sheets.INK)

@@ -7,10 +7,12 @@ from __future__ import annotations
 import colorsys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
 from cachetools import LRUCache
+from numpy.random import Generator
 
 from graspd.service.model.colours import Colour, hexadecimal, linear
 from graspd.service.model.scene_spec import Box as BoxSupport
@@ -18,39 +20,20 @@ from graspd.service.model.scene_spec import HalfSpace
 from graspd.service.model.transforms import Floats, apply
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.rendering.cameras import (
-    SAMPLED,
-    GivenCameras,
-    inscribed_field_of_view,
-    intrinsics,
-    sample_hemisphere,
-    stereo_pair,
-)
+from graspd.worker.rendering import cameras, scenery
+from graspd.worker.rendering.cameras import SAMPLED, GivenCameras, stereo_pair
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.kernels.shading import GRAIN, PLAIN, SPECKLE, TILES
-from graspd.worker.rendering.scenery import (
-    TABLE,
-    Appearance,
-    Box,
-    CameraShot,
-    Lamp,
-    Pictures,
-    Solid,
-    Supports,
-    slab_poses,
-    slabs,
-    visible_share,
-)
+from graspd.worker.rendering.scenery import TABLE, Appearance, Box, CameraShot, Lamp, Pictures, Solid, Supports
 from graspd.worker.rendering.tracer import Tracer
 
-#: Largest number of further draws of a camera, and share of the object that a draw must see past the supports. The
-#: first such draw is used, else the best.
+#: Largest number of further draws of a camera, and share of the object that it must see past the supports if possible.
 _DRAWS: Final = 32
 _SEEN: Final = 0.8
 #: Height at which hidden solids are out of every picture [m].
 _AWAY_M: Final = -50.0
 _NOWHERE: Final = np.zeros((0, 3))
-_stages: LRUCache[tuple[object, ...], Tracer] = LRUCache(4)
+_tracers: LRUCache[tuple[object, ...], Tracer] = LRUCache(4)
 _WOODS: Final = [("#b98a5a", "#8a5c34"), ("#d9b98c", "#b98f5e"), ("#7b5233", "#523320"), ("#a9978a", "#85736a")]
 _STONES: Final = [("#c9c6c0", "#8f8b85"), ("#6f7478", "#45494d"), ("#d8d3c8", "#b5ad9f"), ("#86908a", "#5d6761")]
 _CLOTHS: Final = ["#cfd3d6", "#e4ded2", "#9fb0b8", "#6d7f86", "#b7bda5", "#494f57", "#c9a98b"]
@@ -68,7 +51,7 @@ class CameraPlan:
 
     @property
     def intrinsics(self) -> Floats:
-        return intrinsics(self.width, self.height) if self.given.intrinsics is None else self.given.intrinsics
+        return cameras.intrinsics(self.width, self.height) if self.given.intrinsics is None else self.given.intrinsics
 
     @property
     def placements(self) -> int:
@@ -79,25 +62,16 @@ class CameraPlan:
         return 1 if self.baseline_m is None else 2
 
     def extrinsics(
-        self,
-        centre: Floats,
-        radius: float,
-        rng: np.random.Generator,
-        supports: Supports = (),
-        points: Floats = _NOWHERE,
+        self, centre: Floats, radius: float, rng: Generator, supports: Supports = (), points: Floats = _NOWHERE
     ) -> Floats:
         """Return extrinsics (placements * eyes, 4, 4) around a ball with a free view of the points.
         The left camera of a pair comes before the right one."""
-        middles: Sequence[Floats]
         if self.given.extrinsics is not None:
             middles = list(self.given.extrinsics)
         else:
-            cone = inscribed_field_of_view(self.intrinsics, self.width, self.height)
-            middles = _unobstructed_cameras(
-                lambda: sample_hemisphere(centre, radius, views=self.views, field_of_view=cone, rng=rng),
-                supports,
-                points,
-            )
+            cone = cameras.inscribed_field_of_view(self.intrinsics, self.width, self.height)
+            draw = partial(cameras.sample_hemisphere, centre, radius, views=self.views, field_of_view=cone, rng=rng)
+            middles = _unobstructed_cameras(draw, supports, points)
         if self.baseline_m is None:
             return np.stack(middles)
         return np.stack([eye for middle in middles for eye in stereo_pair(middle, self.baseline_m)])
@@ -117,10 +91,9 @@ class Setting:
         supports: Supports = TABLE,
     ) -> None:
         """`poses` (S, 1 + M, 7) of object and M neighbours in the scene frame; `supports` of all scenes."""
-        self.objects, self.plan, self._slabs = objects, plan, slabs(supports)
-        scenes = [
-            _Scene(objects, pose, plan, supports, np.random.default_rng([seed, s])) for s, pose in enumerate(poses)
-        ]
+        self.objects, self.plan, self._slabs = objects, plan, scenery.slabs(supports)
+        rngs = [np.random.default_rng([seed, s]) for s in range(len(poses))]
+        scenes = [_Scene(objects, pose, plan, supports, rng) for pose, rng in zip(poses, rngs, strict=True)]
         self.object_pose = np.asarray(poses, float)[:, 0]
         self._poses = np.stack([scene.poses for scene in scenes])
         self.looks = [scene.looks for scene in scenes]
@@ -151,10 +124,8 @@ class Setting:
     def shoot_with(self, drawn: DrawnHand, run: ExecutionContext) -> Pictures:
         key = (*self._key(), drawn.hand.content, drawn.wrist is not None, run.device)
         stage = _cached_tracer(key, lambda: [*self._solids(), *(part.solid for part in drawn.parts)], run.device)
-        shown = [part.look for part in drawn.parts]
-        stage.place(
-            np.concatenate([self._poses, drawn.body_poses()], axis=1), [[*looks, *shown] for looks in self.looks]
-        )
+        looks = [[*looks, *(part.look for part in drawn.parts)] for looks in self.looks]
+        stage.place(np.concatenate([self._poses, drawn.body_poses()], axis=1), looks)
         return self._named(stage.shoot(self.shot, run))
 
     def stage(self, device: str, poses: Floats | None = None) -> Tracer:
@@ -175,12 +146,7 @@ class Setting:
 
 class _Scene:
     def __init__(
-        self,
-        objects: Sequence[ObjectModel],
-        poses: Floats,
-        plan: CameraPlan,
-        supports: Supports,
-        rng: np.random.Generator,
+        self, objects: Sequence[ObjectModel], poses: Floats, plan: CameraPlan, supports: Supports, rng: Generator
     ) -> None:
         points = apply(poses[0], objects[0].hull_vertices)
         centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -190,7 +156,7 @@ class _Scene:
         self.lamp = draw_lamp(rng)
         self.turn = float(rng.uniform(0, 2 * np.pi))
         yaw = rng.uniform(0, 2 * np.pi)
-        self.poses = np.concatenate([slab_poses(supports, centre, yaw), poses])
+        self.poses = np.concatenate([scenery.slab_poses(supports, centre, yaw), poses])
         # Random draws for neighbours and walls come last, so that they do not change the appearance of the rest.
         others = [draw_object_look(rng) for _ in objects[1:]]
         walls = draw_table_look(rng) if len(supports) > 1 else table
@@ -201,14 +167,14 @@ class _Scene:
         ]
 
 
-def _unobstructed_cameras(draw: Callable[[], Sequence[Floats]], supports: Supports, points: Floats) -> Sequence[Floats]:
+def _unobstructed_cameras(draw: Callable[[], list[Floats]], supports: Supports, points: Floats) -> list[Floats]:
     """Draw cameras that see the points past boxes; a camera without a free view is drawn again."""
-    drawn = list(draw())
+    drawn = draw()
     if not any(isinstance(s, BoxSupport) for s in supports):
         return drawn
 
     def seen(camera: Floats) -> float:
-        return visible_share(supports, -camera[:3, :3].T @ camera[:3, 3], points)
+        return scenery.visible_share(supports, -camera[:3, :3].T @ camera[:3, 3], points)
 
     share = [seen(camera) for camera in drawn]
     for _ in range(_DRAWS):
@@ -221,9 +187,9 @@ def _unobstructed_cameras(draw: Callable[[], Sequence[Floats]], supports: Suppor
 
 
 def _cached_tracer(key: tuple[object, ...], solids: Callable[[], Sequence[Solid | Box]], device: str) -> Tracer:
-    if key not in _stages:
-        _stages[key] = Tracer(solids(), device)
-    return _stages[key]
+    if key not in _tracers:
+        _tracers[key] = Tracer(solids(), device)
+    return _tracers[key]
 
 
 def hsv(hue: float, saturation: float, value: float) -> Colour:
@@ -231,7 +197,7 @@ def hsv(hue: float, saturation: float, value: float) -> Colour:
     return linear(*colorsys.hsv_to_rgb(hue % 1.0, saturation, value))
 
 
-def draw_table_look(rng: np.random.Generator) -> Appearance:
+def draw_table_look(rng: Generator) -> Appearance:
     """Draw wood, stone, tiles or a plain cloth."""
     kind = int(rng.integers(4))
     scale = float(rng.uniform(0.7, 1.5))
@@ -247,7 +213,7 @@ def draw_table_look(rng: np.random.Generator) -> Appearance:
     return Appearance(hexadecimal(base), pattern=PLAIN, roughness=float(rng.uniform(0.7, 0.95)))
 
 
-def draw_object_look(rng: np.random.Generator) -> Appearance:
+def draw_object_look(rng: Generator) -> Appearance:
     """Draw a glazed, painted, brushed or speckled material of any hue."""
     hue, kind = float(rng.uniform()), int(rng.integers(4))
     base = hsv(hue, float(rng.uniform(0.3, 0.75)), float(rng.uniform(0.5, 0.9)))
@@ -261,7 +227,7 @@ def draw_object_look(rng: np.random.Generator) -> Appearance:
     return Appearance(base, roughness=float(rng.uniform(0.5, 0.8)))
 
 
-def draw_lamp(rng: np.random.Generator) -> Lamp:
+def draw_lamp(rng: Generator) -> Lamp:
     """Draw warm to cool light of random strength before a soft backdrop."""
     warmth, strength = float(rng.uniform(-1, 1)), float(rng.uniform(0.85, 1.15))
     tint = hsv(float(rng.uniform()), 0.12, float(rng.uniform(0.45, 0.8)))

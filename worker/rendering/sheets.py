@@ -45,9 +45,8 @@ def best_transferred_rows(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
 
 def best_in_scenes(base: Arrays, among: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Return the row (S,) of each scene with the largest epsilon among a mask (N,); -1 if it has none."""
-    return _best_of_scenes(
-        base, np.where(among, np.nan_to_num(metric_at_threshold(base, "quality/epsilon"), nan=-1.0), -np.inf)
-    )
+    epsilon = np.nan_to_num(metric_at_threshold(base, "quality/epsilon"), nan=-1.0)
+    return _best_of_scenes(base, np.where(among, epsilon, -np.inf))
 
 
 def _best_of_scenes(columns: Arrays, score: Floats) -> NDArray[np.int32]:
@@ -61,10 +60,7 @@ def _best_of_scenes(columns: Arrays, score: Floats) -> NDArray[np.int32]:
 
 def caption_entries(quality: Arrays, rows: NDArray[np.intp]) -> list[list[tuple[str, str]]]:
     """Return caption entries, label and value, for each row of a base shard."""
-    epsilon, area = (
-        metric_at_threshold(quality, "quality/epsilon"),
-        metric_at_threshold(quality, "quality/contact_area_cm2"),
-    )
+    epsilon, area = (metric_at_threshold(quality, f"quality/{name}") for name in ("epsilon", "contact_area_cm2"))
     depth = np.asarray(quality["quality/penetration_depth_mm"], float)
     return [
         [("epsilon", f"{epsilon[r]:.3f}"), ("contact", f"{area[r]:.1f} cm^2"), ("depth", f"{depth[r]:.2f} mm")]
@@ -248,9 +244,8 @@ RULE: Final = (222, 224, 226)
 ACCENT: Final = (31, 132, 126)
 
 #: Anchors of the depth colours, near to far: even steps of lightness from light to dark, hue from sand to indigo.
-_DEPTH: Final = np.frombuffer(
-    bytes.fromhex("fcf3cf face82 f39e5d dc675c ad3f6b 712b6d 362054 101028"), np.uint8
-).reshape(-1, 3)
+_DEPTH_HEX: Final = "fcf3cf face82 f39e5d dc675c ad3f6b 712b6d 362054 101028"
+_DEPTH: Final = np.frombuffer(bytes.fromhex(_DEPTH_HEX), np.uint8).reshape(-1, 3)
 
 
 @lru_cache(maxsize=16)
@@ -285,7 +280,6 @@ def depth_colours(depth: NDArray[np.float32], near: float, far: float) -> NDArra
 
 
 def png_bytes(image: Image.Image) -> bytes:
-    """Return PNG bytes."""
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=True)
     return buffer.getvalue()

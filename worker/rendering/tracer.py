@@ -15,14 +15,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from graspd.service.model.transforms import (
-    Floats,
-    apply,
-    pose_from_matrix,
-    quat_from_axis_angle,
-    quat_rotate,
-    quat_to_matrix,
-)
+from graspd.service.model import transforms
+from graspd.service.model.transforms import Floats, apply, quat_rotate, quat_to_matrix
 from graspd.worker.engines import backend
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.rendering.annotate import box_corners
@@ -48,7 +42,7 @@ class Tracer:
     """Solids in many worlds. Build once, then `place` and `shoot` repeatedly."""
 
     def __init__(self, solids: Sequence[Solid | Box], device: str) -> None:
-        """`solids`: the P solids that every world has; `device`: name of the Warp device."""
+        """Load the P solids of every world to a Warp device."""
         backend.start_warp()
         self.device = device
         shapes: NDArray[Any] = np.zeros(len(solids), _PLACED.numpy_dtype())
@@ -100,15 +94,17 @@ class Tracer:
 
 
 class _Film:
+    """Pictures of one shot, exposed a few views at a time."""
+
     def __init__(self, tracer: Tracer, shot: CameraShot) -> None:
         self._tracer, self._shot, device = tracer, shot, tracer.device
         passes = light_passes(shot.samples, shot.toward_lamp)
         self._passes = _structs(passes, exposure.LightPass, device)
         # Worlds turn under the lamp, so in their frames lamp and sky turn in the opposite direction.
-        back = quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), -np.asarray(shot.turn))
+        back = transforms.quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), -np.asarray(shot.turn))
         toward = quat_rotate(back[:, None], np.array([one.toward for one in passes]))
         self._toward = wp.array(toward, dtype=wp.vec3f, device=device)
-        poses = pose_from_matrix(np.asarray(np.linalg.inv(shot.extrinsics), np.float64))
+        poses = transforms.pose_from_matrix(np.asarray(np.linalg.inv(shot.extrinsics), np.float64))
         self._cameras = np.asarray(poses[..., [0, 1, 2, 4, 5, 6, 3]], np.float32)
 
     def expose(self, views: NDArray[np.intp], threads: int, pool: ThreadPoolExecutor) -> tuple[NDArray[Any], ...]:
@@ -116,8 +112,7 @@ class _Film:
         tracer, shot, device = self._tracer, self._shot, self._tracer.device
         size, world, k = (len(views), shot.height, shot.width), shot.world[views], shot.intrinsics
         rgb = wp.zeros((*size, 3), dtype=wp.uint8, device=device)
-        depth = wp.empty(size, dtype=wp.float32, device=device)
-        shape = wp.empty(size, dtype=wp.int32, device=device)
+        depth, shape = (wp.empty(size, dtype=kind, device=device) for kind in (wp.float32, wp.int32))
         normal = wp.empty(size if shot.normals else (0, 0, 0), dtype=wp.vec3f, device=device)
         inputs = [
             tracer._placed,
@@ -133,7 +128,6 @@ class _Film:
             shot.shaded,
             threads,
         ]
-
         outputs = [rgb, depth, shape, normal]
 
         def rows(first: int) -> None:
@@ -168,13 +162,12 @@ def light_passes(samples: int, toward_lamp: Floats) -> list[LightPass]:
     sky = 2.0 / (1.0 + SKY_EDGE) * samples / max(1, sky_passes)
     passes = []
     for k in range(samples):
-        across, down = (0.5 + k * _R2) % 1.0 - 0.5
-        shift = (float(across), float(down))
+        across, down = ((0.5 + k * _R2) % 1.0 - 0.5).tolist()
         if k % 2 == 0:
-            toward = _on_disc(toward_lamp, k // 2, lamp_passes)
-            passes.append(LightPass(shift, toward, samples / lamp_passes, 0.0))
+            lamp = _on_disc(toward_lamp, k // 2, lamp_passes)
+            passes.append(LightPass((across, down), lamp, samples / lamp_passes, 0.0))
         else:
-            passes.append(LightPass(shift, _on_sky(k // 2, sky_passes), 0.0, sky))
+            passes.append(LightPass((across, down), _on_sky(k // 2, sky_passes), 0.0, sky))
     return passes
 
 

@@ -22,22 +22,9 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.mesh_geometry import to_centred_frame
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.rendering import pictures as studio
 from graspd.worker.rendering.cameras import intrinsics, look_at
 from graspd.worker.rendering.hands import drawn_bodies, drawn_parts, drawn_poses
-from graspd.worker.rendering.pictures import (
-    FIELD_OF_VIEW,
-    FLOOR,
-    FLOOR_SIZE,
-    NEAR_M,
-    OBJECT_LOOK,
-    SAMPLES,
-    TOWARD_LAMP,
-    fit_camera,
-    floor_pose,
-    hand_points,
-    side_azimuth,
-    studio_shot,
-)
 from graspd.worker.rendering.scenery import Appearance, Box, Solid, Supports, slab_poses, slabs, visible_share
 from graspd.worker.rendering.tracer import Tracer
 from graspd.worker.scenes.neighbours import Neighbours
@@ -89,14 +76,14 @@ def trajectory_pictures(
     sides: int = 1,
     whole: bool = False,
     run: ExecutionContext = DEFAULT_CONTEXT,
-    samples: int = SAMPLES,
+    samples: int = studio.SAMPLES,
 ) -> NDArray[np.uint8]:
     """Render N grasps of F postures from A sides; return sRGB (N, A, F, H, W, 3).
     Postures are in the frame of the object at rest. Sides that show more of object and fingers come first. `whole`
     frames the whole hand; else far parts may be cut off. Raises TaskCancelled: `run.cancelled()` returned True."""
     if not frames:
         return np.zeros((0, sides, 0, size[1], size[0], 3), np.uint8)
-    stage = _Stage(hand, obj, around, len(frames[0]), run, np.inf if whole else NEAR_M)
+    stage = _Stage(hand, obj, around, len(frames[0]), run, np.inf if whole else studio.NEAR_M)
     return np.stack([stage.shoot(number, way, size, sides, samples) for number, way in enumerate(frames)])
 
 
@@ -113,16 +100,15 @@ class _Stage:
         near_m: float,
     ) -> None:
         self.hand, self.frames, self.run, self.near_m = hand, frames, run, near_m
-        self.centre, self.around = np.array(obj.centre), around.centred(obj)
-        self.obj = obj = obj.centred
-        around = self.around
+        self.around = around = around.centred(obj)
+        self.centre, self.obj = np.array(obj.centre), obj.centred
         self.others = around.neighbours.objects if around.neighbours else ()
-        self.boxes = slabs(around.supports) or [Box(FLOOR_SIZE)]
-        objects = [Solid(o.vertices, o.faces, o.corner_normals) for o in (obj, *self.others)]
+        self.boxes = slabs(around.supports) or [Box(studio.FLOOR_SIZE)]
+        objects = [Solid(o.vertices, o.faces, o.corner_normals) for o in (self.obj, *self.others)]
         parts = drawn_parts(hand, mounted=around.wrist is not None)
         self.tracer = Tracer([*self.boxes, *objects, *(part.solid for part in parts)], run.device)
-        planes = [_TABLE if isinstance(s, HalfSpace) else _WALL for s in around.supports] or [FLOOR]
-        self.looks = [*planes, OBJECT_LOOK, *(_BESIDE for _ in self.others), *(part.look for part in parts)]
+        planes = [_TABLE if isinstance(s, HalfSpace) else _WALL for s in around.supports] or [studio.FLOOR]
+        self.looks = [*planes, studio.OBJECT_LOOK, *(_BESIDE for _ in self.others), *(part.look for part in parts)]
 
     def shoot(
         self, number: int, way: Sequence[Waypoint], size: tuple[int, int], sides: int, samples: int
@@ -136,20 +122,20 @@ class _Stage:
         drawn = drawn_poses(self.hand, roots, joints, None if wrist is None else np.tile(wrist[number], (len(way), 1)))
         things = np.stack([compose(rest, np.append(point.carried, IDENTITY_POSE[3:])) for point in way])
         solid = np.stack([apply(pose, self.obj.hull_vertices) for pose in things])
-        points = np.concatenate([solid, hand_points(self.hand, bodies)], axis=1)
+        points = np.concatenate([solid, studio.hand_points(self.hand, bodies)], axis=1)
         middles = 0.5 * (solid.min(axis=1) + solid.max(axis=1))
         reach = float(np.linalg.norm(solid - middles[:, None], axis=2).max()) + self.near_m
         near = points[np.linalg.norm(points - middles[:, None], axis=2) < reach]
-        self._place(scene, things, drawn, floor_pose(points), middles[0])
+        self._place(scene, things, drawn, studio.floor_pose(points), middles[0])
         above = middles[0] + np.array([0, 0, _HIGH_M])
         covered = visible_share(self.around.supports, above, middles[:1]) < 1
-        lamp = _UNDER_A_BOARD if covered else TOWARD_LAMP
+        lamp = _UNDER_A_BOARD if covered else studio.TOWARD_LAMP
         grasp = next((k for k, point in enumerate(way) if point.name == "grasp"), 0)
-        k = intrinsics(*size, FIELD_OF_VIEW)
+        k = intrinsics(*size, studio.FIELD_OF_VIEW)
         pictures = []
-        for angle, height in self._best_sides(grasp, near, side_azimuth(self.hand, bodies[grasp]), sides):
-            cameras = np.stack([fit_camera(near, angle, k, size, elevation=height)] * self.frames)
-            shot = studio_shot(cameras, k, size, np.full(self.frames, angle), samples, toward_lamp=lamp)
+        for angle, height in self._best_sides(grasp, near, studio.side_azimuth(self.hand, bodies[grasp]), sides):
+            cameras = np.stack([studio.fit_camera(near, angle, k, size, elevation=height)] * self.frames)
+            shot = studio.studio_shot(cameras, k, size, np.full(self.frames, angle), samples, toward_lamp=lamp)
             pictures.append(self.tracer.shoot(shot, self.run.without_progress()).rgb)
         return np.stack(pictures)
 
@@ -167,11 +153,12 @@ class _Stage:
         value over all sides. A small bonus favours sides that look across the palm's approach."""
         sides = [(first + 2 * np.pi * a / _AROUND, h) for h in _HEIGHTS for a in range(_AROUND)]
         centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
-        far = 1.15 * float(np.linalg.norm(near - centre, axis=1).max()) / np.sin(FIELD_OF_VIEW / 2)
+        far = 1.15 * float(np.linalg.norm(near - centre, axis=1).max()) / np.sin(studio.FIELD_OF_VIEW / 2)
         eyes = [centre + far * np.array([np.cos(a) * np.cos(h), np.sin(a) * np.cos(h), np.sin(h)]) for a, h in sides]
         cameras = np.stack([look_at(eye, centre) for eye in eyes])
-        k, size, worlds = intrinsics(_GLANCE, _GLANCE, FIELD_OF_VIEW), (_GLANCE, _GLANCE), np.full(len(sides), world)
-        glance = studio_shot(cameras, k, size, np.full(self.frames, first), 1, world=worlds)
+        size, worlds = (_GLANCE, _GLANCE), np.full(len(sides), world)
+        k = intrinsics(*size, studio.FIELD_OF_VIEW)
+        glance = studio.studio_shot(cameras, k, size, np.full(self.frames, first), 1, world=worlds)
         seen = self.tracer.shoot(replace(glance, shaded=False), self.run.without_progress()).shape
         thing = len(self.boxes)
         first_of_hand = thing + 1 + len(self.others)

@@ -59,16 +59,13 @@ def render(
     Raises InputError: a count or size is out of range. TaskCancelled: `run.cancelled()` returned True.
 
     Args:
-        obj: the object.
         object_pose: (S, 7) rest poses in the table frame.
         views: camera placements per scene, unless cameras are given.
-        stereo: whether a placement has rectified left and right pictures.
+        stereo: whether a placement has rectified left and right pictures, `baseline_m` apart.
         width, height: picture size [px].
         seed: seed of cameras, materials and lights, and thus of all pixels. Scene s depends on (seed, s) alone.
         run: receives the number of finished pictures; polled before each launch. Pixels do not depend on its threads.
-        baseline_m: distance of the eyes.
         samples: rays per pixel.
-        extras: further channels, given cameras, neighbours, a hand, supports.
 
     Returns:
         Columns of a views shard with V = S * views * (2 if stereo else 1) pictures, sorted by scene, placement and eye.

@@ -40,10 +40,9 @@ def transfer_grasps(
     hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats, neighbours: Neighbours | None = None
 ) -> dict[str, NDArray[np.generic]]:
     """Transfer every grasp to every scene and compute the clearance of the hand and its mounting.
-    The wrist of a mounting takes the first angles that clear the table; neighbours are ignored in this choice. Grasps
-    and pregrasps are N postures in the object frame; the hand moves in a straight line from pregrasp to grasp.
-    `object_pose` (S, 7) are rest poses in the table frame. The hand must also avoid `neighbours`, other objects on the
-    table. Raises InputError: grasps and pregrasps differ in number.
+    Grasps and pregrasps are N postures in the object frame, joined by straight motions. `object_pose` (S, 7) are rest
+    poses in the table frame. The wrist of a mounting takes the first angles that clear the table, neighbours ignored.
+    Raises InputError: grasps and pregrasps differ in number.
 
     Returns:
         Columns of the scene shard with K = S N rows, scene by scene: `grasp/base_index`, `grasp/scene_index`,
@@ -68,9 +67,8 @@ def transfer_grasps(
     if neighbours is not None:
         beside = _neighbour_clearance(hand, grasp, pregrasp, poses, neighbours, wrist).reshape(-1, 2)
         rejection[(rejection == Rejection.NONE) & (beside[:, 1] < MARGIN_M)] = Rejection.NEIGHBOUR_ON_APPROACH
-        rejection[(rejection >= Rejection.NEIGHBOUR_AT_CONTACT) & (beside[:, 0] < MARGIN_M)] = (
-            Rejection.NEIGHBOUR_AT_CONTACT
-        )
+        blocked = (rejection >= Rejection.NEIGHBOUR_AT_CONTACT) & (beside[:, 0] < MARGIN_M)
+        rejection[blocked] = Rejection.NEIGHBOUR_AT_CONTACT
         result["grasp/neighbour_clearance_m"] = beside[:, 1]
     if joints:
         result["grasp/wrist_positions"] = wrist.reshape(-1, joints)
@@ -86,11 +84,12 @@ def transfer_grasps(
 
 
 def count_rejections(rejection: NDArray[np.uint8]) -> dict[str, int]:
+    """Count the rejected grasps by reason."""
     return {r.name.lower(): int((rejection == r).sum()) for r in Rejection if r is not Rejection.NONE}
 
 
 def approach_postures(grasp: Posture, pregrasp: Posture, postures: int = PATH_POSTURES) -> Posture:
-    """Return (N * postures) postures on the straight trajectory from each pregrasp to its grasp.
+    """Return N * `postures` postures on the straight trajectory from each pregrasp to its grasp.
     Positions and joints move linearly, orientations along the shorter arc (normalised linear interpolation)."""
     t = np.linspace(0.0, 1.0, postures)[None, :, None]
     start, end = pregrasp.hand_pose[:, None], grasp.hand_pose[:, None]
@@ -133,14 +132,13 @@ def _mounting_clearance(
     """Return wrist angles (S, N, K) and lowest heights (S, N, 2) of the mounting [m]; inf without it.
     The heights are those at contact and on the approach, as in `_clearance`."""
     path = approach_postures(grasp, pregrasp).hand_pose.reshape(len(grasp), PATH_POSTURES, 7)
-    angles, heights = [], []
+    angles, heights, which = [], [], np.zeros(len(grasp), np.intp)
     for pose in object_pose:
         table = [Environment((_TABLE.in_frame(pose),), UP)]
         wrist, on_path = choose_wrist(hand, path, table)
-        only = np.zeros(len(grasp), np.intp)
-        at_contact = (
-            on_path if hand.mounting is None else wrist_clearance(hand.mounting, path[:, -1:], wrist, table, only)
-        )
+        at_contact = on_path
+        if hand.mounting is not None:
+            at_contact = wrist_clearance(hand.mounting, path[:, -1:], wrist, table, which)
         angles.append(wrist)
         heights.append(np.stack([at_contact, on_path], axis=-1))
     return np.array(angles), np.array(heights)

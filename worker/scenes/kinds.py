@@ -9,7 +9,7 @@ import numpy as np
 
 from graspd.service.model.errors import SceneError
 from graspd.service.model.scene_spec import BIN_SIZE, MOST_TOUCH, SHELF_SIZE, Box, SceneSpec, supports_in
-from graspd.service.model.transforms import Floats, compose, quat_from_axis_angle, quat_rotate
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_from_axis_angle, quat_rotate
 from graspd.worker.grasps import move_poses
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.rest import lay_flat, resting_faces
@@ -20,7 +20,7 @@ from graspd.worker.simulation.environment import Obstacle
 GAP: Final = 0.01
 #: Least probability of a resting face with `faces all`.
 LEAST_PROBABILITY: Final = 0.03
-#: Tolerated penetration of an object into its support [m]: rest poses are exact, but poses in files are rounded.
+#: Tolerated penetration of an object into its support [m], since poses in files are rounded.
 SUNK: Final = 5e-4
 
 
@@ -41,28 +41,26 @@ def walled_area(spec: SceneSpec) -> tuple[float, float] | None:
 def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     """Compute the object's rest poses in `count` scenes (`faces all`: one for each stable face).
     Return `scene/object_pose` (S, 7) in the scene frame, `scene/rest_probability` (S,), `scene/drop_seconds` (S,).
-    Raises SceneError: the object does not fit between the supports, or a support penetrates it. MeshError: it never
-    comes to rest."""
+    Raises SceneError: the object does not fit between the supports, or penetrates one. MeshError: no rest pose."""
     if spec.target is not None:
         poses = np.tile(np.asarray(spec.target, float), (count, 1))
-        found = {
-            "scene/object_pose": poses,
-            "scene/rest_probability": np.ones(count),
-            "scene/drop_seconds": np.zeros(count),
-        }
+        found = _rest_columns(poses, np.ones(count))
     elif spec.faces == "all":
         found = _each_face(obj, seed)
     else:
         found = drop(obj, count=count, seed=seed)
     poses = found["scene/object_pose"]
-    supports = supports_of(spec)
     if (size := walled_area(spec)) is not None:
-        poses = np.array(
-            [move_inside(obj, pose, size, np.random.default_rng([seed, i])) for i, pose in enumerate(poses)]
-        )
+        rngs = [np.random.default_rng([seed, scene]) for scene in range(len(poses))]
+        poses = np.array([move_inside(obj, pose, size, rng) for pose, rng in zip(poses, rngs, strict=True)])
     poses = poses if spec.target is not None else move_poses(poses, np.zeros(3))
-    check_free(obj, poses, supports)
+    check_free(obj, poses, supports_of(spec))
     return {**found, "scene/object_pose": poses}
+
+
+def _rest_columns(poses: Floats, probability: Floats) -> dict[str, Floats]:
+    seconds = np.zeros(len(poses))
+    return {"scene/object_pose": poses, "scene/rest_probability": probability, "scene/drop_seconds": seconds}
 
 
 def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
@@ -78,14 +76,10 @@ def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
     poses = []
     for number, face in enumerate(chosen):
         turn = np.random.default_rng([seed, number]).uniform(0, 2 * np.pi)
-        pose = rotate_about_vertical(lay_flat(faces, face, np.array([0.0, 0, 0, 1, 0, 0, 0])), turn)
-        pose[:2] -= (pose[:3] + quat_rotate(pose[3:], obj.centre_of_mass))[:2]
+        pose = rotate_about_vertical(lay_flat(faces, face, IDENTITY_POSE), turn)
+        pose[:2] -= apply(pose, obj.centre_of_mass)[:2]
         poses.append(pose)
-    return {
-        "scene/object_pose": np.array(poses),
-        "scene/rest_probability": rest_probability(obj, chosen),
-        "scene/drop_seconds": np.zeros(len(poses)),
-    }
+    return _rest_columns(np.array(poses), rest_probability(obj, chosen))
 
 
 def rotate_about_vertical(pose: Floats, angle: float) -> Floats:
@@ -95,8 +89,7 @@ def rotate_about_vertical(pose: Floats, angle: float) -> Floats:
 
 
 def move_inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
-    """Move the pose to a random place in a rectangle x by y [m] about the origin.
-    Raises SceneError: the object does not fit."""
+    """Move a pose to a random place in a rectangle x by y [m] about the origin; SceneError if too small."""
     corners = quat_rotate(pose[3:], obj.hull_vertices)[:, :2]
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = np.asarray(size) / 2 - GAP
@@ -112,10 +105,9 @@ def move_inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: 
 def check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) -> None:
     """Raise SceneError if the object at a pose (S, 7) penetrates a support by more than `SUNK`."""
     for pose in poses:
-        corners = quat_rotate(pose[3:], obj.hull_vertices) + pose[:3]
+        corners = apply(pose, obj.hull_vertices)
         for number, support in enumerate(supports):
             depth = -float(support.distance(corners).min())
             if depth > SUNK:
-                raise SceneError(
-                    f"{obj.name} is {1e3 * depth:.1f} mm deep in support {number} of its scene; move it or the support"
-                )
+                fault = f"{obj.name} is {1e3 * depth:.1f} mm deep in support {number} of its scene"
+                raise SceneError(f"{fault}; move the object or the support")

@@ -1,8 +1,8 @@
 """Several objects in a scene, dropped together or placed one by one; clearance from neighbours.
 
-Collision shapes are convex hulls. They are exact against the table and conservative between objects, since no object is
-ever placed in another object's hollow. A placed object has the exact rest pose of its own drop. Its position and its
-rotation about the vertical are drawn until its hull is clear of walls and of all other objects."""
+Collision shapes are convex hulls: exact against the table, conservative between objects. A placed object has the rest
+pose of its own drop. Its position and its rotation about the vertical are drawn until its hull is clear of walls and of
+all other objects."""
 
 from __future__ import annotations
 
@@ -14,29 +14,16 @@ import mujoco
 import numpy as np
 
 from graspd.service.model.errors import InputError, MeshError, SceneError
-from graspd.service.model.transforms import Floats, compose, quat_rotate
+from graspd.service.model.transforms import Floats, apply, compose, quat_rotate
 from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import Posture, move_poses
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.objects.mesh_geometry import to_centred_frame, to_file_frame
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.scenes import simulate
 from graspd.worker.scenes.kinds import GAP, SUNK, rotate_about_vertical
 from graspd.worker.scenes.rest import lay_flat, resting_faces, settle
-from graspd.worker.scenes.simulate import (
-    DROP_HEIGHT,
-    MAX_ATTEMPTS,
-    MAX_SETTLE_ANGLE,
-    REACH,
-    REST_SPEED,
-    REST_WINDOW_S,
-    TIMESTEP_S,
-    add_hull,
-    drop,
-    model_above_table,
-    rest_probability,
-    settle_on_face,
-)
 from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation.model import add_shape
 
@@ -45,8 +32,7 @@ TIMEOUT_S: Final = 6.0
 RING: Final = (1.0, 1.25)
 #: Largest distance of resting neighbours from the middle of the table [m].
 NEIGHBOUR_REACH: Final = 0.4
-#: Laying an object flat raises it by the penetration of MuJoCo's soft contacts. A larger rise [m] means that the object
-#: lay on another object.
+#: Largest rise [m] of an object that is laid flat, from the penetration of soft contacts; more means a stacked object.
 MAX_LIFT: Final = 0.003
 #: Clearances are capped at this [m].
 FARTHEST_M: Final = 0.1
@@ -56,8 +42,7 @@ MOST_NEIGHBOURS: Final = 8
 @dataclass(frozen=True)
 class Neighbours:
     objects: Sequence[ObjectModel]
-    poses: Floats
-    """(S, M, 7) in the table frame."""
+    poses: Floats  # (S, M, 7) in the table frame
 
     @property
     def centred(self) -> Neighbours:
@@ -68,11 +53,11 @@ class Neighbours:
 
 
 def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count: int, seed: int) -> dict[str, Floats]:
-    """Drop an object and its neighbours onto a table until all rest, `count` times.
-    The object falls in the middle, the neighbours around it. Drops are redone if an object does not come to rest, rolls
-    away, or leans or lies on another object. Scene i depends on the objects, the seed and i alone. Return the columns
-    of `worker.scenes.simulate.drop`, and `scene/neighbour_pose` (S, M, 7). Raises InputError: count or seed is
-    negative, or there are too many neighbours. MeshError: a hull is flat, or the objects never come to rest."""
+    """Drop an object and its neighbours around it onto a table until all rest, `count` times.
+    A drop is repeated if an object does not come to rest, rolls away, or leans or lies on another object. Scene i
+    depends on the objects, the seed and i alone. Return the columns of `worker.scenes.simulate.drop`, and
+    `scene/neighbour_pose` (S, M, 7). Raises InputError: count or seed is negative, or there are too many neighbours.
+    MeshError: a hull is flat, or the objects never come to rest."""
     if count < 0 or seed < 0 or not 1 <= len(neighbours) <= MOST_NEIGHBOURS:
         raise InputError(
             f"scenes need 1 to {MOST_NEIGHBOURS} neighbours, and a number and a seed of at least 0; "
@@ -86,25 +71,29 @@ def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count:
     return {
         "scene/object_pose": poses[:, 0],
         "scene/neighbour_pose": poses[:, 1:],
-        "scene/rest_probability": rest_probability(obj, [face for _, face, _ in found]),
+        "scene/rest_probability": simulate.rest_probability(obj, [face for _, face, _ in found]),
         "scene/drop_seconds": np.array([seconds for _, _, seconds in found]),
     }
 
 
 class _Heap:
+    """Objects that fall together onto a table."""
+
     def __init__(self, objects: Sequence[ObjectModel]) -> None:
         self.objects = objects
         self.faces = [resting_faces(obj) for obj in objects]
-        self.model = model_above_table(objects)
+        self.model = simulate.model_above_table(objects)
         self.data = mujoco.MjData(self.model)
 
     def redo_until_rest(self, key: tuple[int, int]) -> tuple[Floats, int, float]:
         """Drop until all objects rest; return poses (1 + M, 7), the object's resting face, and seconds."""
-        for attempt in range(MAX_ATTEMPTS):
+        for attempt in range(simulate.MAX_ATTEMPTS):
             if (found := self._drop_once(np.random.default_rng([*key, attempt]))) is not None:
                 return found
         names = ", ".join(repr(obj.name) for obj in self.objects)
-        raise MeshError(f"{names} did not come to rest apart in any of {MAX_ATTEMPTS} drops; try fewer neighbours")
+        raise MeshError(
+            f"{names} did not come to rest apart in any of {simulate.MAX_ATTEMPTS} drops; try fewer neighbours"
+        )
 
     def _drop_once(self, rng: np.random.Generator) -> tuple[Floats, int, float] | None:
         mujoco.mj_resetData(self.model, self.data)
@@ -132,21 +121,21 @@ class _Heap:
         for pose, obj, middle in zip(poses, self.objects, middles, strict=True):
             lowest = float(quat_rotate(pose[3:], obj.hull_vertices)[:, 2].min())
             pose[:2] = middle - quat_rotate(pose[3:], obj.centre_of_mass)[:2]
-            pose[2] = rng.uniform(*DROP_HEIGHT) - lowest
+            pose[2] = rng.uniform(*simulate.DROP_HEIGHT) - lowest
         return poses
 
     def _run(self) -> float | None:
         quiet, radii = 0, np.array([obj.radius for obj in self.objects])
         centres = np.array([obj.centre_of_mass for obj in self.objects])
-        for step in range(round(TIMEOUT_S / TIMESTEP_S)):
+        for step in range(round(TIMEOUT_S / simulate.TIMESTEP_S)):
             mujoco.mj_step(self.model, self.data)
             velocity = self.data.qvel.reshape(-1, 6)
             quaternion = self.data.qpos.reshape(-1, 7)[:, 3:]
             linear = velocity[:, :3] + quat_rotate(quaternion, np.cross(velocity[:, 3:], centres))
             speed = np.linalg.norm(linear, axis=1) + radii * np.linalg.norm(velocity[:, 3:], axis=1)
-            quiet = quiet + 1 if speed.max() < REST_SPEED and self.data.ncon >= len(self.objects) else 0
-            if quiet >= round(REST_WINDOW_S / TIMESTEP_S):
-                return (step + 1) * TIMESTEP_S
+            quiet = quiet + 1 if speed.max() < simulate.REST_SPEED and self.data.ncon >= len(self.objects) else 0
+            if quiet >= round(simulate.REST_WINDOW_S / simulate.TIMESTEP_S):
+                return (step + 1) * simulate.TIMESTEP_S
         return None
 
     def _at_rest(self, seconds: float, rng: np.random.Generator) -> tuple[Floats, int, float] | None:
@@ -156,12 +145,12 @@ class _Heap:
             pose[3:] /= np.linalg.norm(pose[3:])
             face, angle = settle(self.faces[k], pose[3:])
             laid = lay_flat(self.faces[k], face, pose)
-            middle = laid[:3] + quat_rotate(laid[3:], obj.centre_of_mass)
-            lift = abs(float(middle[2] - (pose[:3] + quat_rotate(pose[3:], obj.centre_of_mass))[2]))
-            away = np.hypot(*middle[:2]) > (NEIGHBOUR_REACH if k else REACH)
-            if away or angle > MAX_SETTLE_ANGLE or lift > MAX_LIFT or self.faces[k].can_topple(face):
+            middle = apply(laid, obj.centre_of_mass)
+            lift = abs(float(middle[2] - apply(pose, obj.centre_of_mass)[2]))
+            away = np.hypot(*middle[:2]) > (NEIGHBOUR_REACH if k else simulate.REACH)
+            if away or angle > simulate.MAX_SETTLE_ANGLE or lift > MAX_LIFT or self.faces[k].can_topple(face):
                 return None
-            face, laid = settle_on_face(obj, self.faces[k], face, laid, rng)
+            face, laid = simulate.settle_on_face(obj, self.faces[k], face, laid, rng)
             flat.append(laid)
             first = face if k == 0 else first
         self.data.qpos[:] = np.concatenate(flat)
@@ -180,7 +169,7 @@ def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, nei
         _add_piece(spec, spec.worldbody.add_body(mocap=True), f"p{k}", piece)
     neighbours = neighbours.centred
     for k, obj in enumerate(neighbours.objects):
-        add_hull(spec, spec.worldbody.add_body(mocap=True), f"n{k}", obj.hull_vertices, obj.hull_faces)
+        simulate.add_hull(spec, spec.worldbody.add_body(mocap=True), f"n{k}", obj.hull_vertices, obj.hull_faces)
     model = spec.compile()
     data = mujoco.MjData(model)
     pieces = len(hand.pieces)
@@ -201,7 +190,7 @@ def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, nei
 
 def _add_piece(spec: Any, body: Any, name: str, piece: ConvexPiece) -> None:
     if piece.kind == "hull":
-        add_hull(spec, body, name, piece.vertices, piece.faces)
+        simulate.add_hull(spec, body, name, piece.vertices, piece.faces)
     else:
         add_shape(spec, body.add_geom(), piece, name)
 
@@ -211,8 +200,7 @@ BETWEEN: Final = 0.005
 #: Largest number of draws of a scene, and of the place of each neighbour in a draw.
 _DRAWS: Final = 32
 _PLACES: Final = 100
-#: Largest distance of a neighbour's centre from the object's, as a multiple of the sum of both bounding radii, and the
-#: growth of this multiple after each failed draw.
+#: Largest distance of a neighbour's centre from the object's, in sums of both bounding radii, and its growth per draw.
 _REACH: Final = 1.25
 _FARTHER: Final = 0.1
 
@@ -228,13 +216,15 @@ def place_neighbours(
     seed: int,
 ) -> tuple[Floats, Floats]:
     """Place M neighbours beside an object; return poses (S, 7) of the object and (S, M, 7) of neighbours.
-    All are `BETWEEN` apart and clear of supports. Scene i depends on the objects, the supports, the seed and i alone.
-    `again` returns the pose (7,) of the object in scene i at attempt k. `others` are the neighbours; each rests on z =
-    0. All stay inside the rectangle `within` about the origin, with sides x and y [m]. Raises SceneError: the
-    neighbours do not all fit. MeshError: a neighbour never comes to rest, or is flat."""
+    All are `BETWEEN` apart and clear of supports. `again` returns the pose (7,) of the object in scene i at attempt k;
+    the neighbours `others` rest on z = 0. All stay inside the rectangle `within` about the origin, with sides x and y
+    [m]. Scene i depends on the objects, the supports, the seed and i alone. Raises SceneError: the neighbours do not
+    all fit. MeshError: a neighbour never comes to rest, or is flat."""
     # Copies of one object must not rest in the same pose.
     seeds = [int(np.random.SeedSequence([seed, 1 + k]).generate_state(1)[0]) for k in range(len(others))]
-    resting = [drop(one, count=count, seed=own)["scene/object_pose"] for one, own in zip(others, seeds, strict=True)]
+    resting = [
+        simulate.drop(one, count=count, seed=own)["scene/object_pose"] for one, own in zip(others, seeds, strict=True)
+    ]
     hulls = _Hulls([obj, *others], supports, within)
     poses = np.zeros((count, 1 + len(others), 7))
     for scene in range(count):
@@ -278,6 +268,8 @@ def _draw_poses(
 
 
 class _Hulls:
+    """Convex hulls of objects, to test their places in a scene."""
+
     def __init__(
         self, objects: Sequence[ObjectModel], supports: Sequence[Obstacle], within: tuple[float, float] | None
     ) -> None:
@@ -286,25 +278,23 @@ class _Hulls:
         self._room = np.inf if within is None else np.asarray(within) / 2 - GAP
         spec: Any = mujoco.MjSpec()
         for number, one in enumerate(objects):
-            add_hull(spec, spec.worldbody.add_body(mocap=True), str(number), one.hull_vertices, one.hull_faces)
+            simulate.add_hull(spec, spec.worldbody.add_body(mocap=True), str(number), one.hull_vertices, one.hull_faces)
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
 
     def middle(self, number: int, pose: Floats) -> Floats:
-        return np.asarray((quat_rotate(pose[3:], self.objects[number].centre_of_mass) + pose[:3])[:2])
+        """Return the horizontal position (2,) of an object's centre of mass [m]."""
+        return apply(pose, self.objects[number].centre_of_mass)[:2]
 
     def shift_range(self, number: int, pose: Floats) -> tuple[Floats, Floats]:
         """Return the least and largest shift (2,), (2,) along x and y that keeps an object inside the walls."""
-        corners = self._corners(number, pose)[:, :2]
+        corners = apply(pose, self.objects[number].hull_vertices)[:, :2]
         return -self._room - corners.min(axis=0), self._room - corners.max(axis=0)
 
     def is_clear(self, number: int, pose: Floats) -> bool:
         """Check whether an object is `GAP` away from every support except the one it stands on."""
-        corners = self._corners(number, pose)
+        corners = apply(pose, self.objects[number].hull_vertices)
         return all(_is_separated(support, corners) for support in self._supports)
-
-    def _corners(self, number: int, pose: Floats) -> Floats:
-        return quat_rotate(pose[3:], self.objects[number].hull_vertices) + pose[:3]
 
     def is_apart(self, poses: Sequence[Floats]) -> bool:
         """Check whether the object of the last pose is `BETWEEN` away from the objects of the other poses."""
@@ -318,7 +308,7 @@ class _Hulls:
 
 def _is_separated(support: Obstacle, corners: Floats) -> bool:
     """Check whether a plane of a support separates it from a hull, by `GAP` unless the plane faces up.
-    Two convex bodies may be apart although none of these planes separates them: then the result is False."""
+    The result is False for two bodies that are apart but not separated by such a plane."""
     room = (corners @ support.planes[:, :3].T - support.planes[:, 3]).min(axis=0)
     least = np.where(support.planes[:, 2] > 1 - 1e-6, -SUNK, GAP)
     return bool((room >= least).any())

@@ -26,13 +26,12 @@ from graspd.worker.simulation.environment import Neighbour, Obstacle, Scenes
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import add_mesh
 
-#: Largest number of convex pieces of a neighbour. Hollows may be filled, since no hand reaches into a neighbour's
-#: hollow.
+#: Largest number of convex pieces of a neighbour. Hollows may be filled, since no hand reaches into them.
 MOST_PIECES: Final = 8
 
 
 def neighbour_of(obj: ObjectModel) -> Neighbour:
-    """Return an object as a neighbour: convex pieces, merged by least added volume to `MOST_PIECES`.
+    """Return an object as a neighbour: at most `MOST_PIECES` convex pieces, merged by least added volume.
     Raises MeshError: the object is flat."""
     if any(obj.centre):
         middle, by = neighbour_of(obj.centred), np.array([*obj.centre, 1.0, 0, 0, 0])
@@ -81,9 +80,8 @@ def scenes_of(
     `others` are the objects of `spec.neighbours`, in this order. Return the scenes, and `scene/object_pose` (S, 7),
     `scene/rest_probability` (S,), `scene/drop_seconds` (S,); with neighbours also `scene/neighbour_pose` (S, M, 7).
     Raises SceneError: objects overlap, or do not fit. MeshError: an object never comes to rest, or is flat."""
-    whole, poses = _scenes_of(
-        _centred_spec(spec, obj, others), obj.centred, [other.centred for other in others], count=count, seed=seed
-    )
+    middle = _centred_spec(spec, obj, others)
+    whole, poses = _scenes_of(middle, obj.centred, [other.centred for other in others], count=count, seed=seed)
     poses["scene/object_pose"] = to_file_frame(poses["scene/object_pose"], obj.centre)
     if not others:
         return replace(whole, object_pose=poses["scene/object_pose"]), poses
@@ -97,14 +95,12 @@ def scenes_of(
 def _centred_spec(spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel]) -> SceneSpec:
     """Return the specification with poses of the objects' centres instead of their mesh origins."""
 
-    def told(pose: Any, thing: ObjectModel) -> Any:
+    def centred(pose: Any, thing: ObjectModel) -> Any:
         return None if pose is None else tuple(to_centred_frame(pose, thing.centre).tolist())
 
-    beside = [
-        one.model_copy(update={"pose": told(one.pose, other)})
-        for one, other in zip(spec.neighbours, others, strict=False)
-    ]
-    return spec.model_copy(update={"target": told(spec.target, obj), "neighbours": tuple(beside)})
+    pairs = zip(spec.neighbours, others, strict=False)
+    beside = tuple(one.model_copy(update={"pose": centred(one.pose, other)}) for one, other in pairs)
+    return spec.model_copy(update={"target": centred(spec.target, obj), "neighbours": beside})
 
 
 def _scenes_of(
@@ -112,13 +108,11 @@ def _scenes_of(
 ) -> tuple[Scenes, dict[str, Floats]]:
     supports = supports_of(spec)
     given = [one.pose for one in spec.neighbours if one.pose is not None]
-    if not others:
+    if given or not others:
         poses = rest_poses(spec, obj, count=count, seed=seed)
-        return Scenes(supports, poses["scene/object_pose"]), poses
-    if given:
-        poses = rest_poses(spec, obj, count=count, seed=seed)
-        stand = np.asarray(given, float)
-        poses["scene/neighbour_pose"] = np.tile(stand, (len(poses["scene/object_pose"]), 1, 1))
+        if not others:
+            return Scenes(supports, poses["scene/object_pose"]), poses
+        poses["scene/neighbour_pose"] = np.tile(np.asarray(given, float), (len(poses["scene/object_pose"]), 1, 1))
     elif spec.faces == "drawn" and walled_area(spec) is None:
         try:
             poses = drop_together(obj, others, count=count, seed=seed)
@@ -162,11 +156,8 @@ def _place_objects(
 def _check_apart(things: Sequence[Neighbour], poses: Floats) -> None:
     for (a, b), gap in gaps_between(things, poses).items():
         if -gap.min() > SUNK:
-            names = things[a].obj.name, things[b].obj.name
-            raise SceneError(
-                f"{names[0]} and {names[1]} overlap by {-1e3 * gap.min():.1f} mm in scene {int(gap.argmin())}; "
-                "move one of them"
-            )
+            overlap = f"overlap by {-1e3 * gap.min():.1f} mm in scene {int(gap.argmin())}; move one of them"
+            raise SceneError(f"{things[a].obj.name} and {things[b].obj.name} {overlap}")
 
 
 def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0.1) -> dict[tuple[int, int], Floats]:
@@ -200,9 +191,9 @@ _SAME_M: Final = 1e-7
 
 def enclosing_solid(corners: Floats) -> tuple[Obstacle, float]:
     """Return a convex solid of at most `MOST_PLANES` faces around points (V, 3), and its excess [m].
-    The excess is the largest distance of a corner from the points' hull. The solid begins as the bounding box of the
-    points. While the excess is above `ENOUGH_M`, the farthest corner is cut off along the hull's face that is farthest
-    from this corner. A cut never enters the hull. Raises MeshError: the points lie in a plane."""
+    The excess is the largest distance of a corner from the points' hull. The solid begins as the points' bounding box.
+    While the excess is above `ENOUGH_M`, the farthest corner is cut off along the hull's farthest face.
+    Raises MeshError: the points lie in a plane."""
     from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
     try:

@@ -33,29 +33,22 @@ ROLLS = np.radians(20.0)
 class RestingFaces:
     """C flat faces of the convex hull, in the object frame."""
 
-    normal: Floats
-    """(C, 3) unit normals, outward."""
-    offset: Floats
-    """(C,) normal . x of the face's plane [m]."""
-    successor: Ints
-    """(C,) face onto which the object tips when placed on this face; the face itself where it is stable."""
-    height: Floats
-    """(C,) height of the centre of mass above each face [m]."""
-    sides: Ints
-    """(E, 2) pairs of adjacent faces; a row is one edge of its first face."""
-    margin: Floats
-    """(E,) distance from each edge to the projected centre of mass, positive inside the face [m]."""
-    width: Floats
-    """(E,) width of the face across each edge [m]."""
+    normal: Floats  # (C, 3) unit normals, outward
+    offset: Floats  # (C,) normal . x of the face's plane [m].
+    successor: Ints  # (C,) face onto which the object tips when placed on this face; the face itself where it is stable
+    height: Floats  # (C,) height of the centre of mass above each face [m]
+    sides: Ints  # (E, 2) pairs of adjacent faces; a row is one edge of its first face
+    margin: Floats  # (E,) distance from each edge to the projected centre of mass, positive inside the face [m]
+    width: Floats  # (E,) width of the face across each edge [m]
 
     @property
     def stable_faces(self) -> Ints:
         return np.flatnonzero(self.successor == np.arange(len(self.successor))).astype(np.int32)
 
     def looseness(self, face: int) -> tuple[float, float]:
-        """Return how far the object may turn [rad] and its centre of mass sink [m] after a tilt of `face`.
-        The tilt follows from a change of the surface by `CHANGE_M`. The object tips over all edges that the tilted
-        centre of mass crosses."""
+        """Return the possible rotation [rad] and descent [m] of an object at rest on `face`.
+        A change of the surface by `CHANGE_M` tilts the face. The object then tips over all edges that its centre of
+        mass crosses."""
         from scipy.sparse import csr_array  # slow to import
         from scipy.sparse.csgraph import breadth_first_order
 
@@ -77,8 +70,7 @@ class RestingFaces:
 
 
 def rolling_poses(obj: ObjectModel, poses: Floats) -> int:
-    """Count the rest poses (S, 7) on a table in which the object may roll, because it is round there.
-    A change of its surface by `CHANGE_M` may then turn it by more than `ROLLS`."""
+    """Count the rest poses (S, 7) on a table in which the object may roll, see `RestingFaces.can_roll`."""
     faces = resting_faces(obj.centred)
     return sum(faces.can_roll(settle(faces, pose[3:])[0]) for pose in np.asarray(poses, float))
 
@@ -125,7 +117,7 @@ def _edges(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floats) -
     The distance is from the edge to the projected centre of mass; the extent is the face's width across the edge."""
     edges, pairs = mesh.face_adjacency_edges, mesh.face_adjacency
     corners = [np.unique(mesh.faces[label == face]) for face in range(int(label.max()) + 1)]
-    sides, margins, widths = [], [], []
+    parts = []
     for side in (0, 1):
         here, there = label[pairs[:, side]], label[pairs[:, 1 - side]]
         start, end = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]]
@@ -135,10 +127,10 @@ def _edges(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floats) -
         outward *= -np.sign(np.einsum("ij,ij->i", outward, opposite - start))[:, None]
         between = np.flatnonzero(here != there)
         inside = [((start[k] - mesh.vertices[corners[here[k]]]) @ outward[k]).max() for k in between]
-        sides.append(np.stack([here, there], axis=1)[between])
-        margins.append(np.einsum("ij,ij->i", outward, start - centre)[between])
-        widths.append(np.maximum(inside, 1e-9))
-    return np.concatenate(sides).astype(np.int32), np.concatenate(margins), np.concatenate(widths)
+        margin = np.einsum("ij,ij->i", outward, start - centre)[between]
+        parts.append((np.stack([here, there], axis=1)[between], margin, np.maximum(inside, 1e-9)))
+    sides, margins, widths = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return sides.astype(np.int32), margins, widths
 
 
 def settle(faces: RestingFaces, quaternion: Floats) -> tuple[int, float]:
@@ -152,8 +144,7 @@ def settle(faces: RestingFaces, quaternion: Floats) -> tuple[int, float]:
         if following == face:
             break
         face = following
-    cosine = float(np.clip(faces.normal[face] @ down, -1.0, 1.0))
-    return face, float(np.arccos(cosine))
+    return face, float(np.arccos(np.clip(faces.normal[face] @ down, -1.0, 1.0)))
 
 
 def lay_flat(faces: RestingFaces, face: int, pose: Floats) -> Floats:

@@ -26,8 +26,7 @@ from graspd.worker.validation.prescreening import SLIPS, ShortTests
 from graspd.worker.validation.validator import KnownRollouts, validate
 
 #: Added to the score of a candidate that would lift but whose approach is blocked. The sum is worse than the score of
-#: any candidate that drops the object after a free approach, since most grasps have a free approach. The sum is
-#: better than the score of a lost object.
+#: any candidate that drops the object after a free approach, and better than the score of a lost object.
 BLOCKED: Final = 8.0
 #: Added if only the validator detects contact on the approach: the object's convex pieces protrude from its surface.
 #: Level `dexgraspbench` does not test the approach.
@@ -49,9 +48,7 @@ def rollout_on(
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats] | None:
     """Return the rollout function for the device of `run`, or None. `known` caches verdicts of `level`.
-    Around free objects a GPU has no rollouts, because it plans faster than the CPU simulates. In scenes it waits for
-    the rollouts, which use all threads.
-    """
+    A GPU has no rollouts of free grasps, since it plans faster than a CPU simulates; in scenes they use all threads."""
     on_gpu = run.device.startswith("cuda")
     if not in_scenes:
         return None if on_gpu else hold_rollout(hand, obj, pieces, known=known, level=level)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError, MeshError
 from graspd.service.model.libraries import version_of
-from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.service.model.transforms import Floats, apply, quat_rotate
 from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import move_poses
 from graspd.worker.objects.disk_cache import cached_arrays
@@ -42,15 +42,13 @@ MAX_ATTEMPTS: Final = 50
 #: Number of drops behind `scene/rest_probability`: the standard deviation of a share is about 6 % at most.
 REFERENCE_DROPS: Final = 64
 _REFERENCE_SEED: Final = 2**31
-#: Sliding friction, then torsional and rolling friction [m]. With these values a can or a ball comes to rest, as on
-#: cloth.
+#: Sliding, torsional and rolling friction as on cloth, where a can or a ball comes to rest.
 _CONTACT: Final[dict[str, Any]] = {"friction": [0.8, 0.005, 0.002], "condim": 6, "solref": [0.006, 1]}
 
 
 @dataclass(frozen=True)
 class RestPose:
-    pose: Floats
-    """(7,) object frame in the table frame, laid flat on `face`."""
+    pose: Floats  # (7,) object frame in the table frame, laid flat on `face`
     face: int
     seconds: float
 
@@ -65,12 +63,11 @@ class _Table:
 
 def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     """Drop an object onto a table until it rests, `count` times.
-    A drop is repeated with a new sample if it times out, or if the object leans or rolls away. It is also repeated if a
-    change of the surface by one millimetre makes the object topple. An object that rolls is laid on a steady face,
-    see `settle_on_face`. Scene i depends only on the object, the seed and i. Return `scene/object_pose` (S, 7) with the
-    lowest point of the object at z = 0, and `scene/drop_seconds` (S,). `scene/rest_probability` (S,) is the share of
-    `REFERENCE_DROPS` reference drops (plus this one) on the same face. Raises InputError: count or seed is negative.
-    MeshError: the hull is flat, or the object never comes to rest."""
+    A drop is repeated with a new sample if it times out, if the object leans or rolls away, or if it can topple (see
+    `RestingFaces.can_topple`). An object that can roll is laid on another face, see `settle_on_face`. Scene i depends
+    only on the object, the seed and i. Return `scene/object_pose` (S, 7) with the lowest point at z = 0,
+    `scene/rest_probability` (S,), see `rest_probability`, and `scene/drop_seconds` (S,). Raises InputError: count or
+    seed is negative. MeshError: the hull is flat, or the object never comes to rest."""
     if count < 0 or seed < 0:
         raise InputError(f"scenes and seed must not be negative; got {count} scenes, seed {seed}")
     table = _build(obj.centred)
@@ -91,8 +88,8 @@ def settle_on_face(
     obj: ObjectModel, faces: RestingFaces, face: int, pose: Floats, rng: np.random.Generator
 ) -> tuple[int, Floats]:
     """Return the face on which a centred object stays after coming to rest on `face`, and its pose (7,).
-    If it may roll there, a steady face (on which it does not roll) is drawn from the reference drops. If the object
-    is round on all of these faces, its pose is unchanged."""
+    If the object can roll there, a face on which it cannot roll is drawn from the reference drops. If there is no such
+    face, the pose is unchanged."""
     if not faces.can_roll(face) or not (steady := _steady_faces(obj)):
         return face, pose
     chosen = int(rng.choice(steady))
@@ -179,8 +176,7 @@ def _build(obj: ObjectModel) -> _Table:
 
 def _redo_until_rest(table: _Table, key: tuple[int, int]) -> RestPose:
     for attempt in range(MAX_ATTEMPTS):
-        rest = _drop_once(table, np.random.default_rng([*key, attempt]))
-        if rest is not None:
+        if (rest := _drop_once(table, np.random.default_rng([*key, attempt]))) is not None:
             return rest
     raise MeshError(f"{table.obj.name!r} did not come to rest in any of {MAX_ATTEMPTS} drops; is it a perfect ball?")
 
@@ -202,7 +198,7 @@ def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
     if angle > MAX_SETTLE_ANGLE or table.faces.can_topple(face):
         return None
     pose = lay_flat(table.faces, face, np.concatenate([data.qpos[:3], quaternion]))
-    away = float(np.hypot(*(pose[:3] + quat_rotate(pose[3:], table.obj.centre_of_mass))[:2]))
+    away = float(np.hypot(*apply(pose, table.obj.centre_of_mass)[:2]))
     return RestPose(pose, face, seconds) if away < REACH else None
 
 

@@ -2,8 +2,8 @@
 
 In a scene the lift is a motion against gravity; around a free object it is the retreat along the approach. The hand's
 mounting must be clear as well, at wrist angles that are constant over the trajectory. Clearances are those of
-`body_clearance`, with more tolerance for fingertips that may touch a support. They are exact for half-spaces; for boxes
-and neighbours' pieces some are lower bounds.
+`body_clearance`, with more tolerance for fingertips that may touch a support. Clearances from half-spaces are exact;
+some from boxes and neighbours' pieces are lower bounds.
 
 In a scene, the direction of the approach and the opening of the hand are chosen to avoid object and obstacles."""
 
@@ -41,33 +41,22 @@ _FREE_POINTS: Final = (2000, 3000)
 class Trajectory:
     """Trajectories of N grasps to contact and lift, in the object frame."""
 
-    approach: Floats
-    """(N, W, 7) hand poses from the standoff to the pregrasp, with the joint positions `open`."""
-    open: Floats
-    """(N, J) joint positions of the open hand on its approach."""
-    lift: Posture
-    """N squeeze postures moved up against gravity."""
-    contact: Floats
-    """(N,) least clearance from obstacles at the grasp [m]."""
-    closing: Floats
-    """(N,) least clearance from the pregrasp to the grasp [m]."""
-    coming: Floats
-    """(N,) least clearance from obstacles on the approach [m]; `touching` is the contact with the object."""
-    lifting: Floats
-    """(N,) least clearance on the lift [m]."""
-    touching: NDArray[np.bool_]
-    """(N,) whether the open hand touches the object on its approach."""
-    wrist: Floats
-    """(N, K) angles of the wrist above the hand's root; K is 0 without a wrist."""
+    approach: Floats  # (N, W, 7) hand poses from the standoff to the pregrasp, with the joint positions `open`
+    open: Floats  # (N, J) joint positions of the open hand on its approach
+    lift: Posture  # N squeeze postures moved up against gravity
+    contact: Floats  # (N,) least clearance from obstacles at the grasp [m]
+    closing: Floats  # (N,) least clearance from the pregrasp to the grasp [m]
+    coming: Floats  # (N,) least clearance from obstacles on the approach [m]; `touching` is the contact with the object
+    lifting: Floats  # (N,) least clearance on the lift [m]
+    touching: NDArray[np.bool_]  # (N,) whether the open hand touches the object on its approach
+    wrist: Floats  # (N, K) angles of the wrist above the hand's root; K is 0 without a wrist
     mounting: Floats
-    """(N,) least clearance of the hand's mounting at the grasp, while the hand closes, and on the lift [m].
-    On the approach the mounting counts as part of the hand."""
+    """(N,) least clearance of the hand's mounting, except on the approach, where it counts as part of the hand [m]."""
 
     @property
     def least_clearance(self) -> Floats:
         """(N,) least clearance from obstacles on the whole trajectory [m]."""
-        parts = (self.contact, self.closing, self.coming, self.lifting, self.mounting)
-        return np.asarray(np.minimum.reduce(parts))
+        return np.asarray(np.minimum.reduce([self.contact, self.closing, self.coming, self.lifting, self.mounting]))
 
     @property
     def clear(self) -> NDArray[np.bool_]:
@@ -159,14 +148,10 @@ def _plan_approach(
     probe: Probe, pregrasp: Posture, scene: Environment, ways: Sequence[Floats]
 ) -> tuple[Floats, Floats, NDArray[np.bool_], Floats]:
     """Return approaches along the first free direction of `ways` (n, 3), else along the clearest one.
-    The result has waypoints (n, W, 7), least clearance (n,), a mask (n,) of contact with the object, and direction (n,
-    3)."""
+    The result: waypoints (n, W, 7), least clearance (n,), mask (n,) of contact with the object, direction (n, 3)."""
     count, looks = len(pregrasp), (WAYPOINTS - 1) * LOOKS + 1
-    best = np.full(count, -np.inf)
-    least = np.zeros(count)
-    touching = np.ones(count, bool)
-    chosen = np.zeros((count, 3))
-    open_ = np.arange(count)
+    best, least, touching = np.full(count, -np.inf), np.zeros(count), np.ones(count, bool)
+    chosen, open_ = np.zeros((count, 3)), np.arange(count)
     for tried in ways:
         way = tried[open_]
         poses = _retreat(pregrasp.hand_pose[open_], way, looks)
@@ -198,8 +183,7 @@ OBJECT_MARGIN_M: Final = 0.001
 OBJECT_WANTED_M: Final = 0.004
 #: On its approach the hand may be closer to the object than at its pregrasp, by at most this [m].
 NEARER_M: Final = 5e-4
-#: Number of stored postures from standoff to pregrasp, number of checks between two of them, and number of checks while
-#: the hand closes to the pregrasp.
+#: Numbers of stored postures from standoff to pregrasp, of checks between two of them, and of checks while closing.
 WAYPOINTS: Final = 6
 LOOKS: Final = 4
 _CLOSING: Final = 4
@@ -254,12 +238,10 @@ def _retreat_clearance(
     free = room.reshape(count, looks).min(axis=1)
     rows = np.flatnonzero(free >= MARGIN_M)
     if (mounting := probe.hand.mounting) is not None and len(rows):
-        # A mounting is thicker than a finger, so half as many checks suffice; it is checked only if the hand itself is
-        # clear.
+        # A mounting is thicker than a finger, so half as many checks suffice.
         mounted = wrist_clearance(mounting, poses[rows, :looks:2], wrist[rows], scenes, which[rows])
         free[rows] = np.minimum(free[rows], mounted)
-    # Distances above `reach` count as `reach`.
-    reach = OBJECT_WANTED_M + 2 * NEARER_M
+    reach = OBJECT_WANTED_M + 2 * NEARER_M  # larger distances count as this one
     gap = probe.body_gaps(postures.hand_pose, postures.joint_positions, reach=reach).reshape(count, len(share), -1)
     fingers = finger_of_body(probe.hand) >= 0
     least = np.full(count, np.inf)

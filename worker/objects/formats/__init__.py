@@ -27,8 +27,6 @@ READERS: Final[dict[str, Callable[..., Soup]]] = {
     ".glb": glb.read,
     ".dae": dae.read,
 }
-
-
 #: Python's quotation of text that it cannot parse as a number.
 _NO_NUMBER: Final = re.compile(r": (?:np\.bytes_\()?b?'(.{1,40}?)'")
 #: Formats whose readers take colours from other files, which the mesh names.
@@ -64,8 +62,6 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = no_files) -> Soup:
 
 def _marked_text(data: bytes) -> bytes:
     """Return text data without its byte order mark, which editors write and formats exclude."""
-    if data.startswith(codecs.BOM_UTF8):
-        return data[len(codecs.BOM_UTF8) :]
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace").encode()
-    return data
+    return data.removeprefix(codecs.BOM_UTF8)

@@ -83,6 +83,8 @@ _Lists = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 class _Ascii:
+    """Reads rows of text."""
+
     def __init__(self, body: bytes) -> None:
         self._lines = [line for line in body.splitlines() if line.strip()]
         self._at = 0
@@ -114,9 +116,7 @@ class _Binary:
     """Reads rows of equal width at once, and other rows one by one."""
 
     def __init__(self, body: bytes, order: str) -> None:
-        self._body = body
-        self._order = order
-        self._at = 0
+        self._body, self._order, self._at = body, order, 0
 
     def read(self, element: _Element) -> tuple[dict[str, np.ndarray], _Lists]:
         lists = [p for p in element.properties if p.count_type]
@@ -158,9 +158,7 @@ class _Binary:
                 else:
                     self._take(np.dtype(self._order + p.type), 1)
         empty = [np.zeros(0, np.int64)]
-        return {
-            n: (np.array(counts[n], dtype=np.int64), np.concatenate(empty + items[n]).astype(np.int64)) for n in counts
-        }
+        return {n: (np.array(counts[n], np.int64), np.concatenate(empty + items[n]).astype(np.int64)) for n in counts}
 
     def _take(self, dtype: np.dtype, count: int) -> np.ndarray:
         if count < 0 or dtype.itemsize * count > len(self._body) - self._at:
@@ -178,29 +176,24 @@ _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 
 
 def read_stl(data: bytes) -> Soup:
-    if len(data) >= _HEADER and len(data) == _HEADER + _RECORD.itemsize * _declared_count(data):
-        return _binary(data, _declared_count(data))
+    declared, held = int.from_bytes(data[80:84], "little"), (len(data) - _HEADER) / _RECORD.itemsize
+    if held == declared:
+        return _binary(data, declared)
     if b"\0" not in data[:1024] and (_FACET.search(data) or b"endsolid" in data[-1024:].lower()):
         return _ascii(data)
     if len(data) < _HEADER:
         raise MeshError(f"{len(data)} bytes are too few for an STL file; it is truncated")
     if b"\0" not in data[:1024]:
         raise MeshError("neither binary STL nor text with facets; export the mesh again")
-    held = (len(data) - _HEADER) / _RECORD.itemsize
-    if _declared_count(data) > held:
-        raise MeshError(f"truncated: the header states {_declared_count(data)} faces, but the file has {int(held)}")
+    if declared > held:
+        raise MeshError(f"truncated: the header states {declared} faces, but the file has {int(held)}")
     # Some exporters append their own data; all faces stated in the header are present.
-    return _binary(data, _declared_count(data))
-
-
-def _declared_count(data: bytes) -> int:
-    return int.from_bytes(data[80:84], "little")
+    return _binary(data, declared)
 
 
 def _binary(data: bytes, count: int) -> Soup:
     check_face_count(count)
-    records = np.frombuffer(data, _RECORD, count=count, offset=_HEADER)
-    return _soup(records["corners"].reshape(-1, 3).astype(float))
+    return _soup(np.frombuffer(data, _RECORD, count=count, offset=_HEADER)["corners"].reshape(-1, 3).astype(float))
 
 
 def _ascii(data: bytes) -> Soup:

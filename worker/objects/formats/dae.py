@@ -1,7 +1,7 @@
 """COLLADA: triangles of all meshes of the scene in metres, and their colours.
-A colour is the diffuse colour of the material or the mean of its picture.
 
-The file's unit is applied. Its up axis is ignored, as in the viewers of ROS, for which such meshes are made."""
+A colour is the diffuse colour of the material or the mean of its picture. The file's unit is applied. Its up axis is
+ignored, as in the viewers of ROS, for which such meshes are made."""
 
 from __future__ import annotations
 
@@ -60,6 +60,8 @@ def _unit(root: Element) -> float:
 
 
 class _Library:
+    """Elements of a file by their id, and its meshes and materials, each read once."""
+
     def __init__(self, root: Element, nearby: Nearby) -> None:
         self._nearby = nearby
         self._known = {identity: element for element in root.iter() if (identity := element.get("id"))}
@@ -86,13 +88,10 @@ class _Library:
             for primitive in mesh.findall(kind):
                 inputs = primitive.findall("input")
                 stride = 1 + max((int(i.get("offset", "0")) for i in inputs), default=0)
-                source = next((i for i in inputs if i.get("semantic") == "VERTEX"), None)
+                source = primitive.find("input[@semantic='VERTEX']")
                 if source is None or not 0 < stride <= 64:
                     raise MeshError("a primitive has no vertices; export the mesh again")
-                positions = next(
-                    (i for i in self.named(source.get("source")).findall("input") if i.get("semantic") == "POSITION"),
-                    None,
-                )
+                positions = self.named(source.get("source")).find("input[@semantic='POSITION']")
                 points = self._points(positions.get("source") if positions is not None else None)
                 counts, order = _polygons(primitive, kind, stride)
                 corners = order[int(source.get("offset", "0")) :: stride]
@@ -102,11 +101,9 @@ class _Library:
 
     def _points(self, reference: str | None) -> np.ndarray:
         source = self.named(reference)
-        array = source.find("float_array")
-        accessor = source.find("technique_common/accessor")
-        values = _numbers(array)
-        stride = int(accessor.get("stride", "3")) if accessor is not None else 3
-        start = int(accessor.get("offset", "0")) if accessor is not None else 0
+        values, accessor = _numbers(source.find("float_array")), source.find("technique_common/accessor")
+        facts = {} if accessor is None else accessor.attrib
+        stride, start = int(facts.get("stride", "3")), int(facts.get("offset", "0"))
         if not 3 <= stride <= 64 or start < 0:
             raise MeshError(f"points of {stride} numbers are not read; export the mesh again")
         count = max(len(values) - start, 0) // stride
@@ -128,11 +125,10 @@ class _Library:
             source = next(param.iter("source"), None)
             source = next(param.iter("init_from"), None) if source is None else source
             name = (source.text or "").strip() if source is not None else name
-        image = self.named(name)
-        said = next(image.iter("init_from"), None)
-        inner = said.find("ref") if said is not None else None
-        text = (inner if inner is not None else said).text if said is not None else ""
-        return (text or "").strip()
+        found = next(self.named(name).iter("init_from"), None)
+        inner = found.find("ref") if found is not None else None
+        file = found if inner is None else inner
+        return (file.text or "").strip() if file is not None else ""
 
     def _diffuse(self, material: str) -> np.ndarray:
         unknown = np.full(3, np.nan)

@@ -142,9 +142,8 @@ def _accessor(document: dict[str, Any], binary: bytes, index: Any, shape: str) -
         raise MeshError("truncated: an accessor reaches beyond the binary chunk")
     if not count:
         return np.zeros((0, width))
-    rows = np.lib.stride_tricks.as_strided(
-        np.frombuffer(binary, np.uint8, offset=start), (count, item), (stride, 1), writeable=False
-    )
+    data = np.frombuffer(binary, np.uint8, offset=start)
+    rows = np.lib.stride_tricks.as_strided(data, (count, item), (stride, 1), writeable=False)
     found = np.ascontiguousarray(rows).view(dtype).reshape(count, width)
     if accessor.get("normalized") and dtype.kind in "iu":
         return np.maximum(found / np.iinfo(dtype).max, -1.0)

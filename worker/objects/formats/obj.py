@@ -26,12 +26,9 @@ def no_files(reference: str) -> bytes | None:
 def read(data: bytes, nearby: Nearby = no_files) -> Soup:
     """Read triangles of the polygons; negative indices count from the latest vertex.
     The colour of a face is its corners' mean colour, or else that of its material."""
-    vertices: list[list[bytes]] = []
-    shades: list[list[bytes]] = []
-    corners: list[int] = []
-    counts: list[int] = []
-    libraries: list[bytes] = []
-    used: list[tuple[int, bytes]] = []
+    vertices, shades = list[list[bytes]](), list[list[bytes]]()
+    corners, counts = list[int](), list[int]()
+    libraries, used = list[bytes](), list[tuple[int, bytes]]()
     for line in _lines(data):
         if line.startswith(b"v "):
             numbers = line.split(None, 7)[1:7]
@@ -115,9 +112,8 @@ def _lines(data: bytes) -> Iterable[bytes]:
 
 #: Largest number of materials in a library.
 MAX_MATERIALS: Final = 1024
+#: Function that returns the bytes of a file by its name in a mesh; None if there is no such file.
 Nearby = Callable[[str], bytes | None]
-
-"""Returns the bytes of a file by its name in a mesh; None if the file is not there."""
 
 
 def read_materials(data: bytes, nearby: Nearby) -> dict[bytes, Floats]:
@@ -170,14 +166,11 @@ def mean_colour(data: bytes) -> Floats:
     Raises ValueError, OSError, SyntaxError: too large, or not such a picture (`UNREADABLE`)."""
     from PIL import Image  # loaded late: few meshes have pictures
 
-    bomb = Image.DecompressionBombWarning
+    quiet = warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning)
     try:
-        with (
-            warnings.catch_warnings(action="ignore", category=bomb),
-            Image.open(io.BytesIO(data), formats=_PICTURES) as it,
-        ):
-            if it.width * it.height > MAX_PIXELS:
+        with quiet, Image.open(io.BytesIO(data), formats=_PICTURES) as image:
+            if image.width * image.height > MAX_PIXELS:
                 raise ValueError("the image is too large")
-            return np.asarray(it.convert("RGB").resize((1, 1), Image.Resampling.BOX), float)[0, 0] / 255
+            return np.asarray(image.convert("RGB").resize((1, 1), Image.Resampling.BOX), float)[0, 0] / 255
     except Image.DecompressionBombError as error:
         raise ValueError(str(error)) from error

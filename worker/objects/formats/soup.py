@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import LimitError, MeshError
 from graspd.service.model.transforms import Floats
-from graspd.worker.objects.topology import face_vectors
+from graspd.worker.objects.topology import face_vectors, join_meshes
 
 MAX_FACES: Final = 1_000_000
 #: Largest plausible coordinate in any unit.
@@ -65,21 +65,19 @@ def walk(
 
 def soup_of(parts: Iterable[Part]) -> Soup:
     """Join the placed parts of a scene; mirrored ones are turned outward."""
-    vertices: list[NDArray[np.float64]] = []
-    faces: list[NDArray[np.int64]] = []
-    colours: list[NDArray[np.float64]] = []
+    meshes: list[tuple[Floats, NDArray[np.int64]]] = []
+    colours: list[Floats] = []
     count = total = 0
     for points, triangles, matrix, colour in parts:
         flipped = triangles[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else triangles
-        faces.append(flipped + count)
-        vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
+        meshes.append((points @ matrix[:3, :3].T + matrix[:3, 3], flipped))
         colours.append(np.tile(colour, (len(triangles), 1)))
         count, total = count + len(points), total + len(triangles)
         check_face_count(max(total, count // 3))
-    if not faces:
+    if not meshes:
         raise MeshError("the mesh has no faces; export a scene with a mesh")
     known = np.concatenate(colours)
-    return Soup(np.concatenate(vertices), np.concatenate(faces), None if np.isnan(known).all() else known)
+    return Soup(*join_meshes(meshes), None if np.isnan(known).all() else known)
 
 
 def check_soup(soup: Soup) -> Soup:
@@ -115,9 +113,8 @@ _AGAINST: Final = 1e-9
 
 def triangulate(vertices: Floats, counts: Ints, corners: Ints) -> Ints:
     """Triangulate polygons with `counts` corners each, concatenated in `corners`; return triangles (F, 3).
-    A polygon is cut as a fan from its first corner, or by manifold3d's ear clipping if the fan would leave it. Faces
-    with fewer than three corners are dropped. Raises LimitError: too many faces, or re-entrant polygons of too many
-    corners."""
+    A polygon is cut as a fan from its first corner, or by ear clipping if the fan would leave it. Faces with fewer than
+    three corners are dropped. Raises LimitError: too many faces, or re-entrant polygons of too many corners."""
     number = np.maximum(counts - 2, 0)
     check_face_count(int(number.sum()))
     starts, ends = np.cumsum(counts) - counts, np.cumsum(number)
