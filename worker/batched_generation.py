@@ -131,7 +131,9 @@ class _Job:
             )
             ahead: Future[_Wave] | None = None
             try:
-                while (wave := _next_wave(waiting, fresh, join * BATCH_SIZE)) or ahead is not None:
+                # Batches of one launch have the same requirements.
+                most = 0 if self.request.type == "balanced" else join * BATCH_SIZE
+                while (wave := _next_wave(waiting, fresh, most)) or ahead is not None:
                     planned, ahead = ahead, device.submit(_plan_wave, scoring, wave) if wave else None
                     going |= {batch.number: batch for batch in wave}
                     for batch, error in _score_wave(scoring, planned.result()) if planned is not None else ():
@@ -200,7 +202,8 @@ def _score_wave(scoring: Scoring, wave: _Wave) -> Iterator[tuple[Batch, Exceptio
     """Validate and measure a wave at once; yield each batch with its planning error or None."""
     parts: Iterator[Round] = iter(())
     if wave.whole is not None:
-        scored = scoring.evaluate(wave.whole, scoring.run.without_progress(), wave.known, wave.prefilter)
+        run, required = scoring.run.without_progress(), wave.batches[0].requirements
+        scored = scoring.evaluate(wave.whole, run, wave.known, wave.prefilter, required)
         parts = iter(scored.split([len(made) for made in wave.made if isinstance(made, GraspSet)]))
     for batch, made in zip(wave.batches, wave.made, strict=True):
         if isinstance(made, Exception):

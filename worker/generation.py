@@ -29,8 +29,8 @@ from graspd.worker.hands.pinch_postures import require_opposing
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners import NoStartFound, PlanRequest, Rollout, fitting_pairs, method, synthesize
 from graspd.worker.planners.fast_graspd.antipodal_starts import narrow_reason
-from graspd.worker.quality.diversity import POINTS, distinct_mask, hand_points
 from graspd.worker.planners.requirements import NOTHING, Requirements
+from graspd.worker.quality.diversity import POINTS, distinct_mask, hand_points
 from graspd.worker.quality.gate import GATES, failed_gate, passes_gate
 from graspd.worker.quality.table import measure
 from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, expected_need, next_round, select_rows, split_rows
@@ -49,8 +49,8 @@ from graspd.worker.validation.validator import prefilter_grasps, validate
 
 #: Reasons to reject a grasp. diverged: its numbers are not finite. blocked: an obstacle of its scene is in the way.
 #: dropped: the validator did not hold it. gate: it fails the geometric gate. not_robust: it holds in too few models.
-#: requirements: it fails a requirement on type, digits, region or approach. weak: its payload is too small. alike: it is
-#: a near-duplicate of a selected grasp.
+#: requirements: it fails a requirement on type, digits, region or approach. weak: its payload is too small. alike: it
+#: is a near-duplicate of a selected grasp.
 REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "requirements", "not_robust", "weak", "alike")
 #: Rejections whose names differ from the outcome's; failed pushes and lifts of the validator are `dropped`.
 _REJECTION_OF: Final = {
@@ -363,7 +363,7 @@ class Batch:
         """Begin a batch. `run` reports its progress; `scenes` is its part of the job's scenes, None for all."""
         self.scoring, self.number, self.count, self.run = scoring, number, count, run
         self.request = scoring.request
-        self.requirements = Requirements.of(self.request, number, origin=scoring.centre)
+        self.requirements = Requirements.of(self.request, scoring.hand, number, origin=scoring.centre)
         self.requirements.check(scoring.hand, scoring.obj)
         self.rounds: list[Round] = []
         self.candidates = self.repeated = 0

@@ -23,8 +23,9 @@ def parse_region(text: str) -> list[Plane]:
     for match in found:
         assert match is not None
         axis, sign = "xyz".index(match[1]), 1.0 if match[2] == "<" else -1.0
-        planes.append(tuple(sign if k == axis else 0.0 for k in range(3)) + (sign * float(match[3]),))
-    return planes  # type: ignore[return-value]
+        x, y, z = (sign if k == axis else 0.0 for k in range(3))
+        planes.append((x, y, z, sign * float(match[3])))
+    return planes
 
 
 def parse_cone(text: str) -> tuple[tuple[float, float, float], float]:

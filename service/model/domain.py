@@ -65,6 +65,8 @@ _TYPE_LABELS: Final = {name: name.replace("_", " ") for name in get_args(GraspTy
 SHAKE_NEEDS_A_SCENE: Final = "shake needs a lift out of a scene: choose a scene, such as table"
 
 
+#: Options that state requirements on grasps.
+REQUIREMENTS: Final = ("type", "digits", "touch_region", "avoid_region", "approach_cone")
 DigitName = Literal["thumb", "index", "middle", "ring", "little", "sixth"]
 Region = Annotated[str, Field(max_length=200), AfterValidator(lambda text: text and parse_region(text) and text)]
 Cone = Annotated[str, Field(max_length=80), AfterValidator(lambda text: text and parse_cone(text) and text)]
@@ -150,7 +152,7 @@ class JobOptions(Model):
     ] = _sparse(
         "any",
         description="type of the grasps by contact: power, precision, pinch, lateral, or a type of the GRASP taxonomy. "
-        "balanced: power, precision, pinch and lateral in turn, one per batch",
+        "balanced: power, precision and pinch in turn, one per batch",
     )
     digits: Annotated[
         tuple[DigitName, ...], Option(schema=7, typed="digit that may touch, such as thumb; the others stay open")
@@ -307,6 +309,9 @@ class JobOptions(Model):
                 f"{', '.join(self.object_properties)} requires standard, fast or none"
             )
         self._check_scene()
+        if self.requirements and self.method != "fast_graspd":
+            name = next(iter(self.requirements)).replace("_", "-")
+            raise ValueError(f"method {self.method} plans any grasps: {name} requires method fast_graspd")
         if self.views and not self.scenes:
             raise ValueError("views need scenes: set scenes >= 1")
         if self.validation == "none":
@@ -332,6 +337,12 @@ class JobOptions(Model):
             raise ValueError("payload is measured by a validator: choose one")
         if self.shake:
             raise ValueError("shake is simulated by a validator: choose one")
+
+    @property
+    def requirements(self) -> dict[str, Any]:
+        """Requirements on type, digits, region and approach, without those that are not given."""
+        given = {name: getattr(self, name) for name in REQUIREMENTS}
+        return {name: value for name, value in given.items() if value not in ("any", "", ())}
 
     @property
     def measures_payload(self) -> bool:

@@ -12,7 +12,6 @@ GraspTypeName = Literal[
     "power",
     "precision",
     "pinch",
-    "tip_pinch",
     "palmar_pinch",
     "prismatic_2_finger",
     "tripod",
@@ -30,9 +29,8 @@ GraspTypeName = Literal[
     "power_disk",
     "power_sphere",
     "lateral",
-    "adduction_grip",
 ]
-BALANCED: Final[tuple[GraspTypeName, ...]] = ("power", "precision", "pinch", "lateral")
+BALANCED: Final[tuple[GraspTypeName, ...]] = ("power", "precision", "pinch")
 #: Numbers of the types in the taxonomy.
 TAXONOMY: Final[dict[str, int]] = {
     "large_diameter": 1,
@@ -48,8 +46,6 @@ TAXONOMY: Final[dict[str, int]] = {
     "precision_sphere": 13,
     "tripod": 14,
     "lateral": 16,
-    "adduction_grip": 23,
-    "tip_pinch": 24,
     "sphere_4_finger": 26,
     "quadpod": 27,
     "sphere_3_finger": 28,

@@ -307,6 +307,8 @@ def base_attributes(
         said["outcomes"] = json_attribute(dict(outcomes))
     if request.in_scene:
         said |= {"scene": json_attribute(request.place.to_attribute())} | wrist_attributes(hand)
+    if request.requirements:
+        said["requirements"] = json_attribute(request.requirements)
     if request.models:
         said["robust"] = json_attribute({"models": request.models, "wanted": request.robust})
     if verdict_key is None:

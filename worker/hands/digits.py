@@ -22,8 +22,6 @@ from graspd.worker.objects.memory_cache import cached_by_content
 NAMES: Final = ("thumb", "index", "middle", "ring", "little", "sixth")
 #: Cosine between a surface normal and the axis of flexion above which the surface is a side: 45 degrees.
 SIDE_COS: Final = float(np.sqrt(0.5))
-#: Least cosine between a surface normal and the direction of a fingertip at its end: 60 degrees.
-END_COS: Final = float(np.cos(np.deg2rad(60.0)))
 #: Half the remaining range of locked joints, as a share of their range.
 _LOCKED: Final = 1e-3
 
@@ -36,8 +34,6 @@ class Part(IntEnum):
     PAD = 2
     """All but the sides."""
     SIDES = 3
-    END = 4
-    """End of a fingertip."""
 
 
 @cached_by_content(32)
@@ -90,27 +86,10 @@ def is_side(hand: HandModel, points: SurfacePoints) -> NDArray[np.bool_]:
     return np.asarray(np.abs(np.einsum("ni,ni->n", points.normal, axes[points.body])) > SIDE_COS)
 
 
-def is_end(hand: HandModel, points: SurfacePoints) -> NDArray[np.bool_]:
-    """Return a mask (N,) of points on the ends of fingertips, whose normals are along the fingertip."""
-    out = np.zeros(len(points), bool)
-    for tip in hand.fingertips:
-        mine = np.flatnonzero(points.body == tip)
-        if len(mine):
-            middle = points.position[mine].mean(axis=0)
-            out[mine] = points.normal[mine] @ middle > END_COS * np.linalg.norm(middle)
-    return out
-
-
 def points_of_parts(hand: HandModel, parts: NDArray[np.int32], points: SurfacePoints) -> NDArray[np.bool_]:
     """Return a mask (N,) of points on the `Part` (L,) of their body."""
     part, side = parts[points.body], is_side(hand, points)
-    end = is_end(hand, points) if (part == Part.END).any() else side
-    return np.asarray(
-        (part == Part.WHOLE)
-        | ((part == Part.PAD) & ~side)
-        | ((part == Part.SIDES) & side)
-        | ((part == Part.END) & end & ~side)
-    )
+    return (part == Part.WHOLE) | ((part == Part.PAD) & ~side) | ((part == Part.SIDES) & side)
 
 
 def hand_with_digits(hand: HandModel, names: Sequence[str]) -> HandModel:

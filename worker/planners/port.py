@@ -47,6 +47,7 @@ class PlanRequest:
     first: int = 0
     """Number of the first grasp within its batch; above 0 only for methods with `in_parts`."""
     requirements: Requirements = NOTHING
+    """Requirements on the grasps; equal for all batches of one launch."""
     others_have_place: bool = False
     """Whether other parts of the batch, planned elsewhere, have starts in their scenes.
     If so, the grasps of this part are returned as blocked even if none of them has a start."""

@@ -4,7 +4,7 @@ Requirements act on all steps of planning: starts, contacts of the optimisation,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -51,17 +51,22 @@ class Requirements:
     """Largest angle between a palm's approach and `approach` [rad]."""
 
     @classmethod
-    def of(cls, request: JobOptions, batch: int = 0, *, origin: Floats | None = None) -> Requirements:
+    def of(
+        cls, request: JobOptions, hand: HandModel, batch: int = 0, *, origin: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> Requirements:
         """Return the requirements of a batch; `origin` (3,) is that of the planner's frame in the object frame [m]."""
-        kind = BALANCED[batch % len(BALANCED)] if request.type == "balanced" else request.type
-        rule, digits = RULES.get(kind), request.digits
+        kind: str = request.type
+        if kind == "balanced":
+            kinds = [name for name in BALANCED if digit_names(hand) or not RULES[name].digits]
+            kind = kinds[batch % len(kinds)]
+        rule, digits = RULES.get(kind), tuple[str, ...](request.digits)
         if rule is not None and rule.digits and not digits:
-            digits = NAMES[1:3] if rule.contact == "between_sides" else NAMES[: rule.digits]
+            digits = NAMES[: rule.digits]
         texts = (request.touch_region, request.avoid_region)
         planes = [np.array(parse_region(text)) if text else None for text in texts]
         for half_spaces in planes:
-            if half_spaces is not None and origin is not None:
-                half_spaces[:, 3] -= half_spaces[:, :3] @ origin
+            if half_spaces is not None:
+                half_spaces[:, 3] -= half_spaces[:, :3] @ np.asarray(origin)
         found = cls(kind, digits, ContactRegion(*planes) if any(texts) else WHOLE)
         if request.approach_cone:
             axis, degrees = parse_cone(request.approach_cone)
@@ -82,11 +87,6 @@ class Requirements:
         return self.rule is not None and self.rule.kind == GraspType.PRECISION
 
     @property
-    def by_palm(self) -> bool:
-        """Whether the palm must touch, so that all starts have the palm near the object."""
-        return False
-
-    @property
     def links(self) -> int:
         """Least number of bodies in contact."""
         return max(2, self.rule.digits if self.rule else 0)
@@ -94,11 +94,10 @@ class Requirements:
     def check(self, hand: HandModel, obj: ObjectModel) -> None:
         """Raise InputError if the hand has too few digits, or the object no surface in the region."""
         rule, names = self.rule, digit_names(hand)
-        if rule is not None and not names and (rule.digits or rule.kind == GraspType.LATERAL):
-            raise InputError(f"{hand.name} is a gripper: its grasps are of type precision or power, not {self.type}")
-        if rule is not None and rule.digits > len(names) > 0:
+        if rule is not None and rule.digits > len(names):
+            count = f"has {len(names)}" if names else "is a gripper"
             raise InputError(
-                f"type {self.type} needs {rule.digits} digits; {hand.name} has {len(names)}: choose another type"
+                f"type {self.type} needs {rule.digits} digits, and {hand.name} {count}: choose power or precision"
             )
         self.hand(hand)
         if not self.region.is_whole:
@@ -117,30 +116,27 @@ class Requirements:
         parts = np.full(hand.bodies, Part.WHOLE, np.int32)
         if self.by_pads:
             parts[:] = Part.NONE
-            parts[list(hand.fingertips)] = Part.END if rule is not None and rule.contact == "end" else Part.WHOLE
+            parts[list(hand.fingertips)] = Part.WHOLE
         elif no_palm:
             parts[finger < 0] = Part.NONE
         if self.digits:
             idle = [k for k, name in enumerate(names) if name not in self.digits]
             parts[np.isin(finger, idle)] = Part.NONE
-        if rule is not None and rule.contact in ("thumb_to_side", "between_sides"):
-            thumb = finger == names.index("thumb")
-            parts[~thumb & (parts != Part.NONE)] = Part.SIDES
-            parts[thumb] = Part.NONE
-            if rule.contact == "thumb_to_side":
-                parts[hand.fingertips[names.index("thumb")]] = Part.PAD
+        if rule is not None and rule.to_side:
+            thumb = names.index("thumb")
+            parts[parts != Part.NONE] = Part.SIDES
+            parts[finger == thumb] = Part.NONE
+            parts[hand.fingertips[thumb]] = Part.PAD
         return AllowedContacts(parts, self.region)
 
     def opposed_parts(self, hand: HandModel) -> tuple[NDArray[np.int32], NDArray[np.int32]] | None:
         """Return the two parts of a hand between which it holds the object, as the `Part` (L,) of each body.
         None: the pads of the digits."""
-        rule, finger = self.rule, finger_of_body(hand)
-        if rule is None or rule.contact not in ("end", "thumb_to_side", "between_sides"):
+        if self.rule is None or not self.rule.to_side:
             return None
-        allowed = self.allowed(hand).parts
+        allowed, thumb = self.allowed(hand).parts, finger_of_body(hand) == digit_names(hand).index("thumb")
         assert allowed is not None
-        digit = digit_names(hand).index("index" if rule.contact == "between_sides" else "thumb")
-        return np.where(finger == digit, allowed, Part.NONE), np.where(finger == digit, Part.NONE, allowed)
+        return np.where(thumb, allowed, Part.NONE), np.where(thumb, Part.NONE, allowed)
 
     def axes(self, placed: PlacedGrasps | None, count: int) -> Floats | None:
         """Return the cone's axis (N, 3) of each of `count` grasps in the object frame; None without a cone."""

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from graspd.service.model.grasp_types import TAXONOMY
 from graspd.service.model.metrics import GraspType
 from graspd.service.model.transforms import Floats
-from graspd.worker.hands.digits import digit_order, finger_of_body, is_end, is_side
+from graspd.worker.hands.digits import digit_order, finger_of_body, is_side
 from graspd.worker.hands.model import HandModel
 from graspd.worker.quality.contact import LINK_CONTACT_M
 from graspd.worker.quality.probe import NearestPoints, Probe
@@ -56,8 +56,7 @@ class ContactPattern:
     wraps: Mask
     """(B, F) whether a body of the digit other than its fingertip touches."""
     by_side: Mask
-    by_end: Mask
-    """(B, F) whether most of the digit's contact is on a side, or on the end of its fingertip."""
+    """(B, F) whether most of the digit's contact is on a side."""
     place: Floats
     """(B, F, 3) mean position of the contact [m]."""
     normal: Floats
@@ -78,11 +77,10 @@ class ContactPattern:
         normal = np.einsum("bn,nf,bni->bfi", near, of_digit, found.normal)
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         return cls(
-            palm=touching[:, finger < 0].any(axis=1),
+            palm=np.asarray(touching[:, finger < 0].any(axis=1)),
             touches=np.stack([touching[:, bodies].any(axis=1) for bodies in digits], axis=1),
             wraps=np.stack([touching[:, bodies].any(axis=1) for bodies in inner], axis=1),
             by_side=np.asarray(near @ (of_digit * is_side(hand, points)[:, None]) > 0.5 * total),
-            by_end=np.asarray(near @ (of_digit * is_end(hand, points)[:, None]) > 0.5 * total),
             place=np.einsum("bn,nf,bni->bfi", near, of_digit, found.closest) / share,
             normal=normal / np.maximum(length, 1e-12),
         )
@@ -147,12 +145,13 @@ class Rule:
     arrangement: Literal["any", "line", "round", "disk", "sphere"] = "any"
     width: tuple[float, float] = (0.0, np.inf)
     """Range of `ContactPattern.width` [m]."""
-    contact: Literal["any", "pad", "end", "thumb_to_side", "between_sides"] = "any"
+    to_side: bool = False
+    """Whether the thumb presses with its pad against a side of the other digit."""
 
     def applies(self, seen: ContactPattern) -> Mask:
         """Return a mask (B,) of the grasps of this type."""
         out = seen.types == self.kind
-        if self.digits and self.contact != "between_sides":
+        if self.digits:
             out = out & (seen.count() == self.digits)
         if self.palm is not None:
             out = out & (seen.palm == self.palm)
@@ -164,20 +163,7 @@ class Rule:
                 out = out & (seen.flat == (self.arrangement == "disk"))
         if self.width != (0.0, np.inf):
             out = out & (seen.width >= self.width[0]) & (seen.width < self.width[1])
-        return out & self._has_contact(seen)
-
-    def _has_contact(self, seen: ContactPattern) -> Mask:
-        ends = (seen.touches & seen.by_end)[:, :2].all(axis=1)
-        if self.contact == "end":
-            return np.asarray(ends)
-        if self.contact == "pad":
-            return np.asarray(~ends)
-        if self.contact == "thumb_to_side":
-            return np.asarray(seen.touches[:, 0] & ~seen.by_side[:, 0])
-        if self.contact == "between_sides":
-            both = seen.touches & seen.by_side
-            return np.asarray(~seen.touches[:, 0] & (both.sum(axis=1) == 2) & (seen.touches.sum(axis=1) == 2))
-        return np.ones(len(seen.palm), bool)
+        return out & ~seen.by_side[:, 0] if self.to_side else out
 
 
 _PRECISION, _POWER, _LATERAL = GraspType.PRECISION, GraspType.POWER, GraspType.LATERAL
@@ -186,8 +172,7 @@ RULES: Final = {
     "power": Rule(_POWER),
     "precision": Rule(_PRECISION),
     "pinch": Rule(_PRECISION, 2),
-    "tip_pinch": Rule(_PRECISION, 2, contact="end"),
-    "palmar_pinch": Rule(_PRECISION, 2, contact="pad"),
+    "palmar_pinch": Rule(_PRECISION, 2),
     "prismatic_2_finger": Rule(_PRECISION, 3, arrangement="line"),
     "tripod": Rule(_PRECISION, 3, arrangement="round"),
     "prismatic_3_finger": Rule(_PRECISION, 4, arrangement="line"),
@@ -203,8 +188,7 @@ RULES: Final = {
     "large_diameter": Rule(_POWER, palm=True, arrangement="line", width=(MEDIUM_M[1], np.inf)),
     "power_disk": Rule(_POWER, palm=True, arrangement="disk"),
     "power_sphere": Rule(_POWER, palm=True, arrangement="sphere"),
-    "lateral": Rule(_LATERAL, 2, palm=False, contact="thumb_to_side"),
-    "adduction_grip": Rule(_LATERAL, 2, palm=False, contact="between_sides"),
+    "lateral": Rule(_LATERAL, 2, palm=False, to_side=True),
 }
 
 

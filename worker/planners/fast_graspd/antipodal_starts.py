@@ -51,8 +51,9 @@ from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import OUTERMOST, points_of
 from graspd.worker.simulation.obstacles import MARGIN_M
 
-#: Least cosine between a pair's line and its normals. Such lines are inside the friction cones at half friction. Share of grasps on six objects that lift at half friction, with a cosine
-#: of 0.9: Allegro .39, Shadow .30; with 0.96: Allegro .42, Shadow .39.
+#: Least cosine between a pair's line and its normals. Such lines are inside the friction cones at half friction. Share
+#: of grasps on six objects that lift at half friction, with 0.9: Allegro .39, Shadow .30; with 0.96: Allegro .42,
+#: Shadow .39.
 ACROSS: Final = 0.96
 #: Least distance of the two points [m].
 THINNEST_M: Final = 0.002

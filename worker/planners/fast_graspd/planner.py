@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import partial, reduce
 from typing import Final
 
 import numpy as np
@@ -299,10 +299,8 @@ def _draw_starts(launch: _Launch, rows: Rows, attempt: Rows) -> _Starts:
         opened = starts.open_further(coarse, generators, state, depth, may_open, batches.requirements)
         batches.opened[rows] |= opened.reshape(len(rows), -1).any(axis=1)
     else:
-        starts_of = batches.warm or scene_starts.clear_scene_starts
-        state, depth = starts_of(
-            coarse, generators, each=fidelity.starts, placed=placed, ways=batches.ways, wanted=batches.requirements
-        )
+        starts_of = batches.warm or partial(scene_starts.clear_scene_starts, wanted=batches.requirements)
+        state, depth = starts_of(coarse, generators, each=fidelity.starts, placed=placed, ways=batches.ways)
     touch = Probe(coarse, len(state.pivot)).nearest(state) / DILATION if fidelity.dilation == "touch" else None
     return _Starts(rows, state, depth, touch)
 

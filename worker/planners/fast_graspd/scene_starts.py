@@ -123,7 +123,6 @@ def clear_scene_starts(
     openings = {s: Openings.in_scene(hand, obj, scene, wanted) for s, scene in enumerate(placed.scenes) if s in used}
     scene = np.repeat(placed.index, each)
     reaching = (np.arange(len(scene)) % each % EVERY < REACHING) | wanted.by_pads
-    reaching &= not wanted.by_palm
     reaching &= np.array([len(openings[s].sums) > 0 for s in scene.tolist()], bool)
     count, around = len(scene), _SceneDraws(hand, obj, ways, openings, wanted)
     uniform = np.array([g.random((DRAWS, _UNIFORM)) for g in generators])

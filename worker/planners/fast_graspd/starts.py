@@ -211,8 +211,7 @@ def clear_starts(
     pair = _Pair(hand, obj, wanted=wanted)
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
     deepest = np.full(count, np.inf)
-    antipodal = jaws is None and each > 1 and not wanted.by_palm
-    if antipodal and (reaching := ReachSampling.of(model, wanted)) is not None:
+    if jaws is None and each > 1 and (reaching := ReachSampling.of(model, wanted)) is not None:
         rows = np.arange(count)
         _draw_antipodal(
             reaching, generators, rows if reaching.only else rows[rows % each % 2 == 1], probe, best, deepest
