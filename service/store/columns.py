@@ -212,6 +212,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "outcomes": RootAttribute("text", "JSON: rejected candidates by outcome", _BASE),
     "reason": RootAttribute("text", "why a command found fewer grasps than requested; absent: none are missing", _BASE),
     "grasps_wanted": RootAttribute("integer", "number of requested grasps, if the command was interrupted", _BASE),
+    "requirements": RootAttribute("text", "JSON: required type, digits, region and approach; absent: none", _BASE),
     "robust": RootAttribute("text", "JSON: perturbed models per valid grasp, required share; absent: none", _BASE),
     "verdict_level": RootAttribute("text", "level of validation; `none`: not validated", _BASE),
     "verdict_key": RootAttribute("text", "digest of all settings that affect verdicts; average only equal keys", _BASE),
