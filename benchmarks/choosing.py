@@ -1,0 +1,213 @@
+"""Success of required grasp types, contact regions and approach cones, and number of distinct grasps.
+
+usage: python -m benchmarks.choosing DATA_DIR [--parts precision taxonomy regions cones distinct cost] [--grasps 16]
+           [--seed 1300] [--page OUT.md]
+       DATA_DIR holds hands/ and objects/
+
+A candidate counts if it is valid (level standard, 0.1 kg) and fulfils the requirement by its measured contacts."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cells import HANDS
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.grasp_types import TAXONOMY
+from graspd.service.model.matter import MASS_KG
+from graspd.service.model.scene_spec import parse_scene
+from graspd.worker.files.synthesis import synthesize_grasps
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.planners.requirements import Requirements
+from graspd.worker.quality.diversity import distinct_mask, hand_points
+
+#: Seed that was not used to choose any setting.
+SEED = 1300
+#: Objects of the taxonomy: balls, boxes, cylinders, handles.
+TAXONOMY_OBJECTS = (
+    "003_cracker_box",
+    "005_tomato_soup_can",
+    "006_mustard_bottle",
+    "025_mug",
+    "035_power_drill",
+    "048_hammer",
+    "056_tennis_ball",
+    "061_foam_brick",
+)
+#: Contact regions: the handle of a mug and of a drill, and the neck of a bottle.
+REGIONS = {"025_mug": "x > 0.027", "006_mustard_bottle": "z > 0.15", "035_power_drill": "y > -0.042, y < 0.03"}
+AVOIDED = {"025_mug": "z > 0.05", "006_mustard_bottle": "z > 0.1", "035_power_drill": "y > 0.04"}
+CONES = ("0, 0, -1, 30", "1, 0, 0, 30")
+#: Least mean distance of corresponding hand points of two distinct grasps [m].
+DISTINCT_M = 0.02
+DISTINCT = (128, 256, 512, 1024)
+
+
+class Cell:
+    """Candidates of a hand on an object with required properties."""
+
+    def __init__(self, given: argparse.Namespace, hand: str, name: str, count: int = 0, **required: Any) -> None:
+        mesh, urdf = given.data / "objects" / name / "clean.stl", given.data / "hands" / HANDS[hand]
+        common: dict[str, Any] = {"grasps": count or given.grasps, "want": "candidates", "rechecks": 0}
+        request = JobOptions(**common, seed=given.seed, mass=MASS_KG, **required)
+        scene, began = required.get("scene", "free"), time.process_time()
+        scenes = 0 if scene == "free" else 4
+        found = synthesize_grasps(str(urdf), str(mesh), request, place=parse_scene(scene), scenes=scenes)
+        self.seconds, self.arrays = time.process_time() - began, found.arrays
+        self.hand, self.mesh = hand_from_path(urdf), mesh
+        self.posture = Posture(
+            np.asarray(self.arrays["grasp/hand_pose"]), np.asarray(self.arrays["grasp/joint_positions"])
+        )
+        needed = Requirements.of(request, self.hand)
+        self.valid = np.asarray(self.arrays["quality/valid"]) == 1
+        self.fulfilled = needed.failed(self.hand, self.posture, None, self.arrays) == ""
+
+    @property
+    def good(self) -> NDArray[np.bool_]:
+        return self.valid & self.fulfilled
+
+
+def objects(given: argparse.Namespace) -> list[str]:
+    return sorted(path.parent.name for path in (given.data / "objects").glob("*/clean.stl"))
+
+
+def precision(given: argparse.Namespace) -> Iterator[str]:
+    yield "## Precision grasps\n\n| hand | free | of type precision | on a table | without requirement, free |\n|---|--:|--:|--:|--:|"
+    for hand in HANDS:
+        free = [Cell(given, hand, name, type="precision") for name in objects(given)]
+        table = [Cell(given, hand, name, type="precision", scene="table") for name in objects(given)]
+        plain = [Cell(given, hand, name) for name in objects(given)]
+        for cell in plain:
+            cell.fulfilled = np.asarray(cell.arrays["quality/grasp_type"]) == 2
+        shares = [mean(cell.good for cell in cells) for cells in (free, table, plain)]
+        yield f"| {hand} | {shares[0]} | {mean(cell.fulfilled for cell in free)} | {shares[1]} | {shares[2]} |"
+
+
+def taxonomy(given: argparse.Namespace) -> Iterator[str]:
+    yield (
+        "## Types of the GRASP taxonomy, Shadow\n\nAn object admits a type if one of the candidates counts.\n\n"
+        f"| number | type | objects that admit it (of {len(TAXONOMY_OBJECTS)}) | share on these | best object |\n"
+        "|--:|---|--:|--:|---|"
+    )
+    for name, number in sorted(TAXONOMY.items(), key=lambda item: item[1]):
+        found = {obj: Cell(given, "shadow", obj, given.grasps // 2, type=name).good.mean() for obj in TAXONOMY_OBJECTS}
+        admitted = [share for share in found.values() if share > 0]
+        best = max(found, key=lambda obj: found[obj])
+        share = f"{np.mean(admitted):.2f}" if admitted else "-"
+        yield f"| {number} | {name} | {len(admitted)} | {share} | {best}: {found[best]:.2f} |"
+
+
+def regions(given: argparse.Namespace) -> Iterator[str]:
+    yield (
+        "## Contact regions\n\n| hand | object | contacts required where | candidates that count | valid ones with 95 % of "
+        "the contact inside |\n|---|---|---|--:|--:|"
+    )
+    for hand in HANDS:
+        for key, table in (("touch_region", REGIONS), ("avoid_region", AVOIDED)):
+            for name, text in table.items():
+                cell = Cell(given, hand, name, **{key: text})
+                inside = cell.fulfilled[cell.valid].mean() if cell.valid.any() else np.nan
+                words = text if key == "touch_region" else f"not {text}"
+                yield f"| {hand} | {name} | {words} | {cell.good.mean():.2f} | {inside:.2f} |"
+
+
+def cones(given: argparse.Namespace) -> Iterator[str]:
+    yield (
+        "## Approach cones of 30 degrees\n\n| hand | axis | valid ones inside | candidates that count | without a cone | "
+        "CPU time per valid grasp, relative |\n|---|---|--:|--:|--:|--:|"
+    )
+    for hand in HANDS:
+        plain = [Cell(given, hand, name) for name in REGIONS]
+        for axis in CONES:
+            cells = [Cell(given, hand, name, approach_cone=axis) for name in REGIONS]
+            inside = np.concatenate([cell.fulfilled[cell.valid] for cell in cells]).mean()
+            ratio = cost(cells) / cost(plain)
+            yield (
+                f"| {hand} | {axis} | {inside:.2f} | {mean(cell.good for cell in cells)} | "
+                f"{mean(cell.good for cell in plain)} | {ratio:.2f} |"
+            )
+
+
+def distinct(given: argparse.Namespace) -> Iterator[str]:
+    heads = " | ".join(f"{count} candidates" for count in DISTINCT)
+    yield (
+        "## Distinct valid grasps\n\nTwo grasps are distinct if corresponding points of the hand are 2 cm apart on average, "
+        f"or if other digits touch. Median over the objects.\n\n| hand | {heads} |\n|---|" + "--:|" * len(DISTINCT)
+    )
+    for hand in ("allegro", "shadow"):
+        counts = []
+        for name in given.objects or objects(given):
+            cell = Cell(given, hand, name, max(DISTINCT))
+            counts.append([count_distinct(cell, first) for first in DISTINCT])
+        yield f"| {hand} | " + " | ".join(f"{value:.0f}" for value in np.median(counts, axis=0)) + " |"
+
+
+def count_distinct(cell: Cell, first: int) -> int:
+    """Return the number of distinct valid grasps among the first candidates."""
+    valid = np.flatnonzero(cell.valid[:first])
+    points, digits = hand_points(cell.hand, cell.posture.take(valid)), np.asarray(cell.arrays["quality/digits"])[valid]
+    return sum(int(distinct_mask(points[digits == one], DISTINCT_M).sum()) for one in np.unique(digits))
+
+
+def type_cost(given: argparse.Namespace) -> Iterator[str]:
+    yield (
+        "## Cost of a valid grasp of a type\n\nCPU time per valid grasp of the type, over that of any valid grasp (mug, "
+        "bottle, drill).\n\n| hand | precision | pinch | tripod | power |\n|---|--:|--:|--:|--:|"
+    )
+    for hand in ("allegro", "shadow"):
+        plain = cost([Cell(given, hand, name) for name in REGIONS])
+        ratios = [
+            cost([Cell(given, hand, name, type=kind) for name in REGIONS]) / plain
+            for kind in ("precision", "pinch", "tripod", "power")
+        ]
+        yield f"| {hand} | " + " | ".join(f"{ratio:.2f}" for ratio in ratios) + " |"
+
+
+def mean(masks: Iterator[NDArray[np.bool_]] | Any) -> str:
+    return f"{np.mean([mask.mean() for mask in masks]):.2f}"
+
+
+def cost(cells: Sequence[Cell]) -> float:
+    return sum(cell.seconds for cell in cells) / max(1, sum(int(cell.good.sum()) for cell in cells))
+
+
+PARTS = {
+    "precision": precision,
+    "taxonomy": taxonomy,
+    "regions": regions,
+    "cones": cones,
+    "distinct": distinct,
+    "cost": type_cost,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=list(PARTS))
+    parser.add_argument("--objects", nargs="+")
+    parser.add_argument("--grasps", type=int, default=16)
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--page", type=Path, help="file for the tables in Markdown")
+    given = parser.parse_args()
+    lines = [
+        f"# Choosing grasps\n\n`python -m benchmarks.choosing DATA`: {given.grasps} candidates, seed {given.seed}.\n"
+    ]
+    for part in given.parts:
+        for line in PARTS[part](given):
+            lines.append(line)
+            print(line, flush=True)  # noqa: T201
+        lines.append("")
+    if given.page:
+        given.page.write_text("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
