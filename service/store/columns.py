@@ -217,6 +217,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "verdict_level": RootAttribute("text", "level of validation; `none`: not validated", _BASE),
     "verdict_key": RootAttribute("text", "digest of all settings that affect verdicts; average only equal keys", _BASE),
     "scene": RootAttribute("text", "scene of the grasps, as JSON; absent: planned around a free object"),
+    "transferred_from": RootAttribute("text", "JSON: shard and rows that the grasps were transferred from", _BASE),
     "source": RootAttribute("text", "imported grasps: address or citation of the source", _BASE),
     "licence": RootAttribute("text", "imported grasps: terms of use", _BASE),
     "base_shard": RootAttribute("text", "base shard of the grasps in the scenes", ("scene", "views")),
