@@ -1,7 +1,7 @@
 """Success of required grasp types, contact regions and approach cones, and number of distinct grasps.
 
-usage: python -m benchmarks.choosing DATA_DIR [--parts precision taxonomy regions cones distinct cost] [--grasps 16]
-           [--seed 1300] [--page OUT.md]
+usage: python -m benchmarks.choosing DATA_DIR [--parts precision taxonomy ...] [--grasps 16] [--seed 1300]
+           [--objects 025_mug ...] [--page OUT.md]
        DATA_DIR holds hands/ and objects/
 
 A candidate counts if it is valid (level standard, 0.1 kg) and fulfils the requirement by its measured contacts."""
@@ -22,7 +22,10 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.grasp_types import TAXONOMY
 from graspd.service.model.matter import MASS_KG
 from graspd.service.model.scene_spec import parse_scene
+from graspd.service.store.shards import read_shard, write_shard
+from graspd.worker.files.provenance import id_of_columns
 from graspd.worker.files.synthesis import synthesize_grasps
+from graspd.worker.files.transfer import transfer_grasps
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.planners.requirements import Requirements
@@ -61,6 +64,7 @@ class Cell:
         scenes = 0 if scene == "free" else 4
         found = synthesize_grasps(str(urdf), str(mesh), request, place=parse_scene(scene), scenes=scenes)
         self.seconds, self.arrays = time.process_time() - began, found.arrays
+        self.attributes = {**found.attributes, "shard_id": id_of_columns(found.arrays)}
         self.hand, self.mesh = hand_from_path(urdf), mesh
         self.posture = Posture(
             np.asarray(self.arrays["grasp/hand_pose"]), np.asarray(self.arrays["grasp/joint_positions"])
@@ -78,8 +82,16 @@ def objects(given: argparse.Namespace) -> list[str]:
     return sorted(path.parent.name for path in (given.data / "objects").glob("*/clean.stl"))
 
 
+def head(title: str, text: str, *columns: str) -> str:
+    return f"## {title}\n\n{text}\n\n| {' | '.join(columns)} |\n|{'---|' * len(columns)}"
+
+
 def precision(given: argparse.Namespace) -> Iterator[str]:
-    yield "## Precision grasps\n\n| hand | free | of type precision | on a table | without requirement, free |\n|---|--:|--:|--:|--:|"
+    yield head(
+        "Precision grasps",
+        "Shares of candidates that count.",
+        *("hand", "free", "of type precision", "on a table", "without requirement, free"),
+    )
     for hand in HANDS:
         free = [Cell(given, hand, name, type="precision") for name in objects(given)]
         table = [Cell(given, hand, name, type="precision", scene="table") for name in objects(given)]
@@ -91,10 +103,10 @@ def precision(given: argparse.Namespace) -> Iterator[str]:
 
 
 def taxonomy(given: argparse.Namespace) -> Iterator[str]:
-    yield (
-        "## Types of the GRASP taxonomy, Shadow\n\nAn object admits a type if one of the candidates counts.\n\n"
-        f"| number | type | objects that admit it (of {len(TAXONOMY_OBJECTS)}) | share on these | best object |\n"
-        "|--:|---|--:|--:|---|"
+    yield head(
+        "Types of the GRASP taxonomy, Shadow",
+        f"An object admits a type if one of the candidates counts. {len(TAXONOMY_OBJECTS)} objects.",
+        *("number", "type", "objects that admit it", "share on these", "best object"),
     )
     for name, number in sorted(TAXONOMY.items(), key=lambda item: item[1]):
         found = {obj: Cell(given, "shadow", obj, given.grasps // 2, type=name).good.mean() for obj in TAXONOMY_OBJECTS}
@@ -105,9 +117,10 @@ def taxonomy(given: argparse.Namespace) -> Iterator[str]:
 
 
 def regions(given: argparse.Namespace) -> Iterator[str]:
-    yield (
-        "## Contact regions\n\n| hand | object | contacts required where | candidates that count | valid ones with 95 % of "
-        "the contact inside |\n|---|---|---|--:|--:|"
+    yield head(
+        "Contact regions",
+        "The region is obeyed if 95 % of the contact is inside.",
+        *("hand", "object", "region", "candidates that count", "valid ones that obey"),
     )
     for hand in HANDS:
         for key, table in (("touch_region", REGIONS), ("avoid_region", AVOIDED)):
@@ -119,9 +132,10 @@ def regions(given: argparse.Namespace) -> Iterator[str]:
 
 
 def cones(given: argparse.Namespace) -> Iterator[str]:
-    yield (
-        "## Approach cones of 30 degrees\n\n| hand | axis | valid ones inside | candidates that count | without a cone | "
-        "CPU time per valid grasp, relative |\n|---|---|--:|--:|--:|--:|"
+    yield head(
+        "Approach cones of 30 degrees",
+        "CPU time per valid grasp is relative to that without a cone.",
+        *("hand", "axis", "valid ones inside", "candidates that count", "without a cone", "CPU time"),
     )
     for hand in HANDS:
         plain = [Cell(given, hand, name) for name in REGIONS]
@@ -136,10 +150,11 @@ def cones(given: argparse.Namespace) -> Iterator[str]:
 
 
 def distinct(given: argparse.Namespace) -> Iterator[str]:
-    heads = " | ".join(f"{count} candidates" for count in DISTINCT)
-    yield (
-        "## Distinct valid grasps\n\nTwo grasps are distinct if corresponding points of the hand are 2 cm apart on average, "
-        f"or if other digits touch. Median over the objects.\n\n| hand | {heads} |\n|---|" + "--:|" * len(DISTINCT)
+    yield head(
+        "Distinct valid grasps",
+        "Two grasps are distinct if corresponding points of the hand are 2 cm apart on average, or if other digits "
+        "touch. Median over the objects.",
+        *("hand", *(f"{count} candidates" for count in DISTINCT)),
     )
     for hand in ("allegro", "shadow"):
         counts = []
@@ -157,9 +172,10 @@ def count_distinct(cell: Cell, first: int) -> int:
 
 
 def type_cost(given: argparse.Namespace) -> Iterator[str]:
-    yield (
-        "## Cost of a valid grasp of a type\n\nCPU time per valid grasp of the type, over that of any valid grasp (mug, "
-        "bottle, drill).\n\n| hand | precision | pinch | tripod | power |\n|---|--:|--:|--:|--:|"
+    yield head(
+        "Cost of a valid grasp of a type",
+        "CPU time per valid grasp of the type, over that of any valid grasp (mug, bottle, drill).",
+        *("hand", "precision", "pinch", "tripod", "power"),
     )
     for hand in ("allegro", "shadow"):
         plain = cost([Cell(given, hand, name) for name in REGIONS])
@@ -168,6 +184,23 @@ def type_cost(given: argparse.Namespace) -> Iterator[str]:
             for kind in ("precision", "pinch", "tripod", "power")
         ]
         yield f"| {hand} | " + " | ".join(f"{ratio:.2f}" for ratio in ratios) + " |"
+
+
+def transfer(given: argparse.Namespace) -> Iterator[str]:
+    yield head(
+        "Transfer from Allegro to Shadow",
+        "Valid Allegro grasps, and those for which a Shadow grasp of the same type is valid, with 95 % of the contact in "
+        "the box of the Allegro contacts enlarged by 15 mm.",
+        *("object", "Allegro", "Shadow"),
+    )
+    shares, shadow = [], str(given.data / "hands" / HANDS["shadow"])
+    for name in given.objects or objects(given):
+        cell = Cell(given, "allegro", name, given.grasps // 2)
+        shard = read_shard(write_shard("base", cell.arrays, cell.attributes), kind="base")
+        arrays, _ = transfer_grasps(shard, shadow)
+        shares.append(len(arrays["quality/valid"]) / cell.valid.sum())
+        yield f"| {name} | {cell.valid.sum()} | {len(arrays['quality/valid'])} |"
+    yield f"\nMean share: {np.mean(shares):.2f}"
 
 
 def mean(masks: Iterator[NDArray[np.bool_]] | Any) -> str:
@@ -185,6 +218,7 @@ PARTS = {
     "cones": cones,
     "distinct": distinct,
     "cost": type_cost,
+    "transfer": transfer,
 }
 
 
