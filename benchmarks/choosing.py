@@ -189,8 +189,8 @@ def type_cost(given: argparse.Namespace) -> Iterator[str]:
 def transfer(given: argparse.Namespace) -> Iterator[str]:
     yield head(
         "Transfer from Allegro to Shadow",
-        "Valid Allegro grasps, and those for which a Shadow grasp of the same type is valid, with 95 % of the contact in "
-        "the box of the Allegro contacts enlarged by 15 mm.",
+        "Valid Allegro grasps, and those for which a Shadow grasp of the same type is valid, with 95 % of the contact "
+        "in the box of the Allegro contacts enlarged by 15 mm.",
         *("object", "Allegro", "Shadow"),
     )
     shares, shadow = [], str(given.data / "hands" / HANDS["shadow"])
