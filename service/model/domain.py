@@ -162,10 +162,15 @@ class JobOptions(Model):
     touch_region: Annotated[
         Region,
         Option(schema=7),
-        Form("grasps", "Contact region", "bounds in the object's frame [m]", placeholder="z > 0.05", cells=True),
-    ] = _sparse("", description="region of all contacts: bounds in the object's frame [m], such as z > 0.05, x < 0.02")
+        Form("grasps", "Contact region", "bounds [m], part or color", placeholder="z > 0.05", cells=True),
+    ] = _sparse(
+        "",
+        description="region of all contacts: bounds in the object's frame [m], such as z > 0.05, x < 0.02; or a part "
+        "of the mesh, such as part handle (OBJ: group, object or material; GLB: node, mesh or material); or the faces "
+        "of a color, such as color #ff0000. graspd objects check lists parts and colours",
+    )
     avoid_region: Annotated[Region, Option(schema=7)] = _sparse(
-        "", description="region without contacts: bounds in the object's frame [m], such as z > 0.1"
+        "", description="region without contacts: bounds [m] such as z > 0.1, a part or a color, as in touch_region"
     )
     approach_cone: Annotated[
         Cone,
