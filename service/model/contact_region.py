@@ -40,7 +40,7 @@ def is_part_name(text: str) -> bool:
 
 
 def parse_region(text: str) -> RegionSpec:
-    """Parse bounds such as `z > 0.05, x < 0.02` [m], all of which the region fulfils, `part NAME` or `color #rrggbb`.
+    """Parse bounds such as `z > 0.05, x < 0.02` [m], `part NAME` or `color #rrggbb`; all bounds apply.
     Raises ValueError: another form, more than `MOST_PLANES` bounds, or a name that is too long or not printable."""
     if (colour := _COLOUR.fullmatch(text.strip())) is not None:
         return RegionSpec(colour=f"#{colour[1].lower()}")

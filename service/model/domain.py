@@ -162,15 +162,14 @@ class JobOptions(Model):
     touch_region: Annotated[
         Region,
         Option(schema=7),
-        Form("grasps", "Contact region", "bounds [m], part or color", placeholder="z > 0.05", cells=True),
+        Form("grasps", "Contact region", "bounds [m], part or colour", placeholder="z > 0.05", cells=True),
     ] = _sparse(
         "",
-        description="region of all contacts: bounds in the object's frame [m], such as z > 0.05, x < 0.02; or a part "
-        "of the mesh, such as part handle (OBJ: group, object or material; GLB: node, mesh or material); or the faces "
-        "of a color, such as color #ff0000. graspd objects check lists parts and colours",
+        description="region of all contacts: bounds in the object's frame [m], such as z > 0.05, x < 0.02. part NAME: "
+        "a group, object or material of an OBJ; a node, mesh or material of a GLB. color #rrggbb: faces of this colour",
     )
     avoid_region: Annotated[Region, Option(schema=7)] = _sparse(
-        "", description="region without contacts: bounds [m] such as z > 0.1, a part or a color, as in touch_region"
+        "", description="region without contacts: bounds [m] such as z > 0.1, part NAME or color #rrggbb"
     )
     approach_cone: Annotated[
         Cone,

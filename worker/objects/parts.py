@@ -1,4 +1,4 @@
-"""Named and coloured parts of an uploaded mesh, as labelled samples of its surface and as voxels of a region."""
+"""Named and coloured parts of an uploaded mesh: labelled samples of its surface, voxels of a region."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class SurfaceParts:
 
 
 def parts_of(soup: Soup, vertices: Floats, faces: Indices) -> SurfaceParts | None:
-    """Return samples of the parts of a mesh in metres, with faces as in the soup; None for one part in one colour."""
+    """Return samples of a mesh in metres, with the soup's faces; None for one part in one colour."""
     paint = soup.colours if soup.paint is None else soup.paint
     colours = np.zeros((len(faces), 4), np.uint8)
     if paint is not None:
@@ -86,7 +86,7 @@ def parts_of(soup: Soup, vertices: Floats, faces: Indices) -> SurfaceParts | Non
 
 @dataclass(frozen=True)
 class Voxels:
-    """Voxels of a region in the box of an object; a place beside the box has the value of the nearest voxel."""
+    """Voxels of a region in an object's box; a place beside it has the value of the nearest voxel."""
 
     inside: NDArray[np.bool_]  # (X, Y, Z)
     origin: Floats  # (3,) lowest corner of the first voxel, object frame [m]
@@ -103,21 +103,17 @@ class Voxels:
         return np.asarray(self.inside[x, y, z])
 
 
+@cached_by_content(8)
 def voxels_of(parts: SurfaceParts | None, region: RegionSpec, low: Floats, high: Floats, name: str) -> Voxels:
-    """Return the voxels of a part or colour between the corners `low` and `high` (3,), relative to the middle [m].
+    """Return the voxels of a part or colour in a box from `low` to `high` (3,) about the middle [m].
     A voxel is inside if the sample nearest to its centre is. Raises InputError: object `name` has no such part."""
+    from scipy.spatial import cKDTree
+
     if parts is None or not parts.select(region).any():
         known = [] if parts is None else parts.listed_colours if region.colour else parts.listed
         kind = "colours" if region.colour else "named parts"
-        what = f"its {kind} are {', '.join(known)}" if known else f"it has no several {kind}"
+        what = f"its {kind} are {', '.join(known)}" if known else f"its mesh has no {kind} to choose from"
         raise InputError(f"{name} has no {region}: {what}")
-    return _voxels(parts, region, low, high)
-
-
-@cached_by_content(8)
-def _voxels(parts: SurfaceParts, region: RegionSpec, low: Floats, high: Floats) -> Voxels:
-    from scipy.spatial import cKDTree
-
     cell = _cell(high - low)
     shape = np.maximum(np.ceil((high - low) / cell - 1e-6), 1).astype(int)
     centres = low + (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) + 0.5) * cell

@@ -14,7 +14,7 @@ from graspd.worker.objects.parts import Voxels
 
 @dataclass(frozen=True)
 class ContactRegion:
-    """Intersections of half-spaces (K, 4): n.x <= d as (n, d), object frame [m]; or voxels of a part of the mesh."""
+    """Intersections of half-spaces (K, 4), n.x <= d as (n, d), object frame [m]; or voxels of a part."""
 
     touch: Floats | Voxels | None = None
     """Contacts must be inside; None: anywhere."""

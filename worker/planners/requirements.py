@@ -61,8 +61,9 @@ class Requirements:
         obj: ObjectModel | None = None,
         origin: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> Requirements:
-        """Return the requirements of a batch; `origin` (3,) is that of the planner's frame in the object frame [m].
-        Raises InputError: a region names a part that `obj` does not have."""
+        """Return the requirements of a batch.
+        `origin` (3,) is that of the planner's frame in the object frame [m]. Raises InputError: no such part of `obj`.
+        """
         kind: str = request.type
         if kind == "balanced":
             kinds = [name for name in BALANCED if digit_names(hand) or not RULES[name].digits]

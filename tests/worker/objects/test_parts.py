@@ -130,11 +130,11 @@ def test_the_check_lists_parts_and_colours() -> None:
 
 
 def test_an_unknown_part_is_refused_with_the_known_ones() -> None:
-    for text, told in (("part lid", "grip, handle, pot"), ("color #00ff00", "no several colours")):
+    for text, told in (("part lid", "grip, handle, pot"), ("color #00ff00", "no colours to choose from")):
         with pytest.raises(InputError, match=told) as error:
             region_of(load(OBJ), text)
         assert "\n" not in str(error.value) and "m has no" in str(error.value)
-    with pytest.raises(InputError, match="no several named parts"):
+    with pytest.raises(InputError, match="no named parts to choose from"):
         region_of(load(stl(BODY)), "part lid")
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -17,7 +16,7 @@ from graspd.worker.objects.formats.soup import Soup, check_face_count, triangula
 _NAMES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
 _TYPES = dict(zip(_NAMES.split(), 2 * ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), strict=True))
 _MAX_ELEMENTS = 16
-_COLOUR_NAMES: Final = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_COLOURS: Final = ("red", "green", "blue")
 
 
 @dataclass
@@ -67,11 +66,10 @@ def read_ply(data: bytes) -> Soup:
 
 def _colours(element: _Element, scalars: dict[str, np.ndarray]) -> np.ndarray | None:
     """Return the sRGB colours (N, 3), 0 .. 1, of vertices or faces; None without colours."""
-    names = next((names for names in _COLOUR_NAMES if all(name in scalars for name in names)), None)
-    if names is None:
+    if not all(name in scalars for name in _COLOURS):
         return None
     largest = {p.name: {"u1": 255.0, "u2": 65535.0}.get(p.type, 1.0) for p in element.properties}
-    return np.clip(np.stack([scalars[name].astype(float) / largest[name] for name in names], axis=1), 0, 1)
+    return np.clip(np.stack([scalars[name].astype(float) / largest[name] for name in _COLOURS], axis=1), 0, 1)
 
 
 def _header(lines: list[str]) -> tuple[str | None, list[_Element]]:
@@ -120,7 +118,7 @@ class _Ascii:
             return {p.name: table[:, i] for i, p in enumerate(element.properties)}, {}
         counts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_type}
         items: dict[str, list[int]] = {name: [] for name in counts}
-        scalars: dict[str, list[float]] = {p.name: [] for p in element.properties if p.name in chain(*_COLOUR_NAMES)}
+        scalars: dict[str, list[float]] = {p.name: [] for p in element.properties if p.name in _COLOURS}
         for row in rows:
             words = iter(row.split())
             for item in element.properties:

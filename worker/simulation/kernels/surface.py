@@ -31,8 +31,8 @@ class Surface:
 
 @wp.struct
 class ContactRegions:
-    """Regions of the object, each an intersection of half-spaces (K,): n.x <= d as (n, d), origin: centre of mass;
-    and voxels without contact."""
+    """Regions of the object: intersections of half-spaces (K,), and voxels without contact.
+    Half-spaces are n.x <= d as (n, d); the origin is the centre of mass."""
 
     allowed: wp.array(dtype=wp.vec4)  # contact only inside; empty: everywhere
     forbidden: wp.array(dtype=wp.vec4)  # no contact inside; empty: nowhere
