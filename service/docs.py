@@ -81,8 +81,22 @@ def keywords_stub() -> str:
     ]
     job, python = keywords_of(JobOptions, "job"), keywords_of(LocalOptions, "python")
     for title, keywords in (("JobKeywords", job), ("SynthesizeKeywords", python)):
-        parts += ["", f"class {title}(TypedDict, total=False):", *(f"    {row.name}: {text}" for row, text in keywords)]
+        parts += [
+            "",
+            f"class {title}(TypedDict, total=False):",
+            *(_stub_line(row.name, text) for row, text in keywords),
+        ]
     return "\n".join(parts) + "\n"
+
+
+def _stub_line(name: str, text: str) -> str:
+    """Return a keyword's line; long lists of choices have one choice a line, as the formatter writes them."""
+    line = f"    {name}: {text}"
+    return line if len(line) <= 120 else re.sub(r"\[(.*)]$", lambda m: _column(m[1]), line)
+
+
+def _column(choices: str) -> str:
+    return "[\n" + "".join(f"        {choice},\n" for choice in choices.split(", ")) + "    ]"
 
 
 PARTS: Final[dict[str, Callable[[], str]]] = {

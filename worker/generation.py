@@ -363,7 +363,7 @@ class Batch:
         """Begin a batch. `run` reports its progress; `scenes` is its part of the job's scenes, None for all."""
         self.scoring, self.number, self.count, self.run = scoring, number, count, run
         self.request = scoring.request
-        self.requirements = Requirements.of(self.request, scoring.hand, number, origin=scoring.centre)
+        self.requirements = Requirements.of(self.request, scoring.hand, number, obj=scoring.obj, origin=scoring.centre)
         self.requirements.check(scoring.hand, scoring.obj)
         self.rounds: list[Round] = []
         self.candidates = self.repeated = 0

@@ -1,9 +1,10 @@
-"""Regions of an object as half-spaces, and cones of approach directions, as text."""
+"""Regions of an object as half-spaces, parts or colours, and cones of approach directions, as text."""
 
 from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass
 from typing import Final
 
 Plane = tuple[float, float, float, float]
@@ -13,19 +14,51 @@ _NUMBER: Final = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _BOUND: Final = re.compile(rf"([xyz])\s*([<>])\s*({_NUMBER})")
 
 
-def parse_region(text: str) -> list[Plane]:
-    """Parse bounds such as `z > 0.05, x < 0.02` [m]; the region fulfils all of them.
-    Return its half-spaces n.x <= d as (n, d). Raises ValueError: another form, or more than `MOST_PLANES` bounds."""
-    found = [_BOUND.fullmatch(part.strip()) for part in text.split(",")]
+_PART: Final = re.compile(r"part +(.*)", re.DOTALL)
+_COLOUR: Final = re.compile(r"color +#([0-9a-fA-F]{6})")
+#: Largest length of a part's name.
+LONGEST_NAME: Final = 80
+
+
+@dataclass(frozen=True)
+class RegionSpec:
+    """A region of an object: bounds, or a part of its mesh, or the faces of a colour."""
+
+    planes: tuple[Plane, ...] = ()
+    """Half-spaces n.x <= d as (n, d), all of which contain the region."""
+    part: str = ""
+    colour: str = ""
+    """sRGB as #rrggbb, lower case."""
+
+    def __str__(self) -> str:
+        return f"color {self.colour}" if self.colour else f"part {self.part}"
+
+
+def is_part_name(text: str) -> bool:
+    """Check whether a region can name a part of a mesh by this text."""
+    return 0 < len(text) <= LONGEST_NAME and text.isprintable() and text == text.strip()
+
+
+def parse_region(text: str) -> RegionSpec:
+    """Parse bounds such as `z > 0.05, x < 0.02` [m], `part NAME` or `color #rrggbb`; all bounds apply.
+    Raises ValueError: another form, more than `MOST_PLANES` bounds, or a name that is too long or not printable."""
+    if (colour := _COLOUR.fullmatch(text.strip())) is not None:
+        return RegionSpec(colour=f"#{colour[1].lower()}")
+    if (part := _PART.fullmatch(text.strip())) is not None and is_part_name(part[1]):
+        return RegionSpec(part=part[1])
+    found = [_BOUND.fullmatch(bound.strip()) for bound in text.split(",")]
     if not 1 <= len(found) <= MOST_PLANES or None in found:
-        raise ValueError(f"a region is up to {MOST_PLANES} bounds in metres, such as z > 0.05, x < 0.02; got {text!r}")
-    planes = []
+        raise ValueError(
+            f"a region is up to {MOST_PLANES} bounds in metres, such as z > 0.05, x < 0.02; or part NAME; or "
+            f"color #rrggbb; got {text!r}"
+        )
+    planes = list[Plane]()
     for match in found:
         assert match is not None
         axis, sign = "xyz".index(match[1]), 1.0 if match[2] == "<" else -1.0
         x, y, z = (sign if k == axis else 0.0 for k in range(3))
         planes.append((x, y, z, sign * float(match[3])))
-    return planes
+    return RegionSpec(tuple(planes))
 
 
 def parse_cone(text: str) -> tuple[tuple[float, float, float], float]:

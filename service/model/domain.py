@@ -162,10 +162,14 @@ class JobOptions(Model):
     touch_region: Annotated[
         Region,
         Option(schema=7),
-        Form("grasps", "Contact region", "bounds in the object's frame [m]", placeholder="z > 0.05", cells=True),
-    ] = _sparse("", description="region of all contacts: bounds in the object's frame [m], such as z > 0.05, x < 0.02")
+        Form("grasps", "Contact region", "bounds [m], part or colour", placeholder="z > 0.05", cells=True),
+    ] = _sparse(
+        "",
+        description="region of all contacts: bounds in the object's frame [m], such as z > 0.05, x < 0.02. part NAME: "
+        "a group, object or material of an OBJ; a node, mesh or material of a GLB. color #rrggbb: faces of this colour",
+    )
     avoid_region: Annotated[Region, Option(schema=7)] = _sparse(
-        "", description="region without contacts: bounds in the object's frame [m], such as z > 0.1"
+        "", description="region without contacts: bounds [m] such as z > 0.1, part NAME or color #rrggbb"
     )
     approach_cone: Annotated[
         Cone,

@@ -88,6 +88,9 @@ def _object(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "mesh", f"{faces}; largest surface deviation {1e3 * facts['deviation_m']:.2f} mm"
     if (moved := facts.get("repair_deviation_m")) is not None and moved > _NOTHING_M:
         yield "repaired", f"surface moved by at most {1e3 * moved:.2g} mm"
+    for name in ("parts", "colours"):
+        if facts.get(name):
+            yield name, ", ".join(facts[name])
     if "volume_m3" in facts:
         mass = facts.get("mass_kg")
         assumed = " assumed" if facts.get("mass_stated") is False else ""

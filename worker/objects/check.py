@@ -39,6 +39,7 @@ def check_object(
         f"{name}: {size} mm, {facts['faces']} faces, {1e6 * facts['volume_m3']:.1f} cm3, {facts['mass_kg']:.3g} kg"
         + ("" if facts["mass_stated"] else " assumed"),
         *mesh.repairs,
+        *(["parts: " + ", ".join(facts["parts"])] if facts["parts"] else []),
         *facts["notes"],
     ]
     verdict = "repair" if mesh.repairs else "accept"
@@ -67,5 +68,7 @@ def _facts(mesh: RepairedMesh, face_error_m: float, options: ObjectOptions) -> d
         "radius_m": model.radius,
         "watertight": model.watertight,
         "units": options.units,
+        "parts": mesh.parts.listed if mesh.parts else [],
+        "colours": mesh.parts.listed_colours if mesh.parts else [],
         "notes": notes,
     }

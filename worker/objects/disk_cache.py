@@ -115,6 +115,8 @@ def revision(files: tuple[str, ...], libraries: tuple[str, ...]) -> str:
 _NAMES: Final = frozenset({"name", "digest"})
 #: Metadata of a field that `content_of` ignores while it has its default.
 TOLD_IF_SET: Final = MappingProxyType({"told_if_set": True})
+#: Metadata of a field that `content_of` ignores.
+NOT_CONTENT: Final = MappingProxyType({"not_content": True})
 
 
 def content_of(model: Any) -> str:
@@ -129,7 +131,7 @@ def content_of(model: Any) -> str:
 
 def _digest_fields(model: Any) -> dict[str, Any]:
     """Return the fields of a dataclass that affect its digest."""
-    values = {f: getattr(model, f.name) for f in fields(model)}
+    values = {f: getattr(model, f.name) for f in fields(model) if not f.metadata.get("not_content")}
     return {
         f.name: value
         for f, value in values.items()

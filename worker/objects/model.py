@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import MeshError
 from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG
 from graspd.service.model.transforms import Floats
-from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_of
+from graspd.worker.objects.disk_cache import NOT_CONTENT, TOLD_IF_SET, content_of
+from graspd.worker.objects.parts import SurfaceParts
 
 Ints = NDArray[np.int32]
 
@@ -39,6 +40,8 @@ class ObjectModel:
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # middle of the mesh [m]; zero for a model that is `centred`
     mass: float = field(default=MASS_KG, metadata=TOLD_IF_SET)  # [kg]
     friction: float = field(default=FRICTION, metadata=TOLD_IF_SET)  # Coulomb coefficient of its contacts in simulation
+    parts: SurfaceParts | None = field(default=None, repr=False, metadata=NOT_CONTENT)
+    """Named and coloured parts of the uploaded mesh, for contact regions; None for one part in one colour."""
     about_centre: Floats | None = field(default=None, repr=False)
     """(V + H + 1, 3) vertices, hull and centre of mass relative to the middle [m]; None if centred."""
 

@@ -29,6 +29,7 @@ from graspd.worker.objects.formats import READERS, read_mesh
 from graspd.worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
 from graspd.worker.objects.model import Ints, ObjectModel
 from graspd.worker.objects.options import OF_MATTER, parse_options
+from graspd.worker.objects.parts import SurfaceParts
 from graspd.worker.objects.repair import RepairedMesh, repair
 from graspd.worker.objects.topology import Indices
 
@@ -119,6 +120,7 @@ def build_model(mesh: RepairedMesh, face_error_m: float) -> ObjectModel:
         watertight=mesh.watertight,
         deviation_m=error,
         repairs=mesh.repairs,
+        parts=mesh.parts,
     )
     return middle.place_at(mesh.centre)
 
@@ -295,13 +297,18 @@ def _thin_variants(original: ReferenceMesh, error_m: float) -> list[Mesh]:
 
 
 _ARRAYS: Final = ("vertices", "faces", "corner_normals", "centre_of_mass", "inertia", "hull_vertices", "hull_faces")
-_NAMES: Final = ("name", "digest", "about_centre")
+_NAMES: Final = ("name", "digest", "about_centre", "parts")
+#: Arrays of `SurfaceParts`, which only objects of several parts or colours have, and their names as JSON.
+_PARTS: Final = ("points", "index", "colours")
 
 
 def to_bytes(obj: ObjectModel) -> bytes:
     """Serialise an object without its name and digest, bit for bit."""
     plain = {f.name: getattr(obj, f.name) for f in fields(obj) if f.name not in (*_ARRAYS, *_NAMES)}
     arrays: dict[str, Any] = {name: getattr(obj.centred, name) for name in _ARRAYS}
+    if obj.parts is not None:
+        arrays |= {f"part_{name}": getattr(obj.parts, name) for name in _PARTS}
+        arrays["part_names"] = np.frombuffer(json.dumps(obj.parts.names).encode(), np.uint8)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays, plain=np.frombuffer(json.dumps(plain).encode(), np.uint8))
     return buffer.getvalue()
@@ -312,6 +319,9 @@ def from_bytes(data: bytes, *, name: str, digest: str) -> ObjectModel:
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
         plain = json.loads(stored["plain"].tobytes())
         arrays = {field: stored[field] for field in _ARRAYS}
+        if "part_names" in stored:
+            names = tuple(map(tuple, json.loads(stored["part_names"].tobytes())))
+            plain["parts"] = SurfaceParts(names=names, **{name: stored[f"part_{name}"] for name in _PARTS})
     x, y, z = plain.pop("centre")
     middle = ObjectModel(name=name, digest=digest, **arrays, **plain | {"repairs": tuple(plain["repairs"])})
     return middle.place_at((x, y, z))

@@ -20,6 +20,7 @@ from graspd.worker.objects.formats import Soup
 from graspd.worker.objects.intersections import intersecting_faces, untangle
 from graspd.worker.objects.mesh_geometry import CentredMesh, centre_points, signed_volume
 from graspd.worker.objects.options import UNITS
+from graspd.worker.objects.parts import SurfaceParts, parts_of
 from graspd.worker.objects.topology import Indices
 
 MAX_EXTENT_M: Final = 3.0
@@ -57,6 +58,7 @@ class RepairedMesh:
     self_intersections: int | None = None  # pairs of faces that still intersect; None if not checked
     moved_m: float = 0.0  # largest distance of the repaired surface from the original [m]
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the middle in the file's frame [m]
+    parts: SurfaceParts | None = None
 
     def with_faces(self, vertices: Floats, faces: Indices, repair: str) -> RepairedMesh:
         return replace(self, vertices=vertices, faces=faces, repairs=(*self.repairs, repair))
@@ -73,6 +75,7 @@ def repair(soup: Soup, options: ObjectOptions) -> RepairedMesh:
         if found.resolution * unit <= max(COARSE_M, 1e-3 * unit * float(np.ptp(found.points, axis=0).max())):
             raise
         raise MeshError(f"{error}; {_resolution_note(found, unit)}", facts=error.facts) from None
+    mesh = replace(mesh, parts=parts_of(soup, given.vertices, given.faces))
     if not mesh.repairs:
         return mesh
     moved = MeshDistance(given.vertices, given.faces).largest(surface_points(mesh.vertices, mesh.faces, _SAMPLES))

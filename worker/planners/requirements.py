@@ -21,6 +21,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.digits import NAMES, Part, digit_names, digit_order, finger_of_body, hand_with_digits
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.parts import Voxels, voxels_of
 from graspd.worker.objects.region import WHOLE, ContactRegion
 from graspd.worker.planners.fitting import region_points
 from graspd.worker.quality.grasp_type import RULES, Rule, pattern_of
@@ -52,9 +53,17 @@ class Requirements:
 
     @classmethod
     def of(
-        cls, request: JobOptions, hand: HandModel, batch: int = 0, *, origin: Sequence[float] = (0.0, 0.0, 0.0)
+        cls,
+        request: JobOptions,
+        hand: HandModel,
+        batch: int = 0,
+        *,
+        obj: ObjectModel | None = None,
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> Requirements:
-        """Return the requirements of a batch; `origin` (3,) is that of the planner's frame in the object frame [m]."""
+        """Return the requirements of a batch.
+        `origin` (3,) is that of the planner's frame in the object frame [m]. Raises InputError: no such part of `obj`.
+        """
         kind: str = request.type
         if kind == "balanced":
             kinds = [name for name in BALANCED if digit_names(hand) or not RULES[name].digits]
@@ -63,11 +72,8 @@ class Requirements:
         if rule is not None and rule.digits and not digits:
             digits = NAMES[: rule.digits]
         texts = (request.touch_region, request.avoid_region)
-        planes = [np.array(parse_region(text)) if text else None for text in texts]
-        for half_spaces in planes:
-            if half_spaces is not None:
-                half_spaces[:, 3] -= half_spaces[:, :3] @ np.asarray(origin)
-        found = cls(kind, digits, ContactRegion(*planes) if any(texts) else WHOLE)
+        regions = [_region(text, obj, np.asarray(origin)) if text else None for text in texts]
+        found = cls(kind, digits, ContactRegion(*regions) if any(texts) else WHOLE)
         if request.approach_cone:
             axis, degrees = parse_cone(request.approach_cone)
             found = replace(found, approach=np.array(axis) / np.linalg.norm(axis), cone=float(np.deg2rad(degrees)))
@@ -193,6 +199,18 @@ class Requirements:
                 right &= (mask & 1 == 1) & (count_bits(mask) == self.rule.digits)
             out[~right] = "other_type"
         return out
+
+
+def _region(text: str, obj: ObjectModel | None, origin: Floats) -> Floats | Voxels:
+    spec = parse_region(text)
+    if not spec.planes:
+        if obj is None:
+            raise InputError(f"region {spec} needs an object")
+        corners = obj.centred.vertices
+        return voxels_of(obj.parts, spec, corners.min(axis=0), corners.max(axis=0), obj.name)
+    half_spaces = np.array(spec.planes)
+    half_spaces[:, 3] -= half_spaces[:, :3] @ origin
+    return half_spaces
 
 
 def count_bits(numbers: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -70,9 +70,16 @@ class AllowedContacts:
     def regions(self, origin: Floats) -> Any:
         """Upload the regions relative to `origin` (3,) to the current device."""
         out = surface.ContactRegions()
-        for name, planes in (("allowed", self.region.touch), ("forbidden", self.region.avoid)):
-            planes = np.zeros((0, 4)) if planes is None else planes - [0, 0, 0, 1] * (planes[:, :3] @ origin)[:, None]
+        for name, given in (("allowed", self.region.touch), ("forbidden", self.region.avoid)):
+            planes = np.zeros((0, 4))
+            if isinstance(given, np.ndarray):
+                planes = given - [0, 0, 0, 1] * (given[:, :3] @ origin)[:, None]
             setattr(out, name, wp.array(planes, dtype=wp.vec4, ndim=1))
+        voxels = self.region.forbidden
+        closed = np.zeros((0, 0, 0), np.uint8) if voxels is None else voxels.inside.astype(np.uint8)
+        out.closed = wp.array(closed, dtype=wp.uint8, ndim=3)
+        if voxels is not None:
+            out.origin, out.cell = wp.vec3(*(voxels.origin - origin)), voxels.cell
         out.clearance = 0.0 if self is ANYWHERE else NO_CONTACT_M
         return out
 

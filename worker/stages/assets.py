@@ -14,6 +14,7 @@ from typing import Any
 from cachetools import LRUCache
 
 from graspd.service.model import names
+from graspd.service.model.contact_region import parse_region
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import DamagedError, MeshError, NotFoundError
 from graspd.service.model.messages import TaskMessage
@@ -62,10 +63,14 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
     """Load the object of a task, simplified within the tolerance of its fidelity."""
     request, digest = message.request, message.object_digest
     name, error = request.object, request.knobs.face_error_m
-    terms = (error, request.validation == "dexgraspbench", *request.object_properties.items())
+    regions = (request.touch_region, request.avoid_region)
+    terms = (error, regions, request.validation == "dexgraspbench", *request.object_properties.items())
 
     def load() -> ObjectModel:
         obj = prepared_object(store, digest, name=name, face_error_m=error)
+        if obj.parts is None and any(text and not parse_region(text).planes for text in regions):
+            # Objects that were stored by earlier versions have no parts.
+            obj = _load(store, digest, name=name, face_error_m=error)
         if not store.exists(names.asset_model_key(AssetKind.OBJECT, digest)):
             # The model does not depend on which fidelity comes first.
             shown = prepared_object(store, digest, name=name, face_error_m=SHOWN_ERROR_M)

@@ -1,4 +1,6 @@
-"""PLY (ASCII, binary of both byte orders), STL (binary, ASCII) and OFF, without colours and normals."""
+"""PLY (ASCII, binary of both byte orders), STL (binary, ASCII) and OFF, without normals.
+
+Colours of a PLY are those of its faces, or else of most corners of a face. They select faces but are not drawn."""
 
 from __future__ import annotations
 
@@ -14,6 +16,7 @@ from graspd.worker.objects.formats.soup import Soup, check_face_count, triangula
 _NAMES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
 _TYPES = dict(zip(_NAMES.split(), 2 * ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), strict=True))
 _MAX_ELEMENTS = 16
+_COLOURS: Final = ("red", "green", "blue")
 
 
 @dataclass
@@ -42,16 +45,31 @@ def read_ply(data: bytes) -> Soup:
     body = _Ascii(data[start:]) if order is None else _Binary(data[start:], order)
     vertices = np.zeros((0, 3))
     polygons = (np.zeros(0, np.int64), np.zeros(0, np.int64))
+    of_vertices = of_faces = None
     for element in elements:
         scalars, lists = body.read(element)
         if element.name == "vertex":
             vertices = np.stack([scalars[axis].astype(float) for axis in "xyz"], axis=1)
+            of_vertices = _colours(element, scalars)
         elif element.name == "face":
             name = next((p.name for p in element.properties if p.count_type and p.name.startswith("vertex_ind")), None)
             if name is None:
                 raise MeshError("the faces have no list vertex_indices")
-            polygons = lists[name]
-    return Soup(vertices, triangulate(vertices, *polygons))
+            polygons, of_faces = lists[name], _colours(element, scalars)
+    faces = triangulate(vertices, *polygons)
+    if of_faces is not None:
+        return Soup(vertices, faces, paint=np.repeat(of_faces, np.maximum(polygons[0] - 2, 0), axis=0))
+    if of_vertices is None or (faces < 0).any() or (faces >= len(vertices)).any():
+        return Soup(vertices, faces)
+    return Soup(vertices, faces, paint=np.median(of_vertices[faces], axis=1))
+
+
+def _colours(element: _Element, scalars: dict[str, np.ndarray]) -> np.ndarray | None:
+    """Return the sRGB colours (N, 3), 0 .. 1, of vertices or faces; None without colours."""
+    if not all(name in scalars for name in _COLOURS):
+        return None
+    largest = {p.name: {"u1": 255.0, "u2": 65535.0}.get(p.type, 1.0) for p in element.properties}
+    return np.clip(np.stack([scalars[name].astype(float) / largest[name] for name in _COLOURS], axis=1), 0, 1)
 
 
 def _header(lines: list[str]) -> tuple[str | None, list[_Element]]:
@@ -100,16 +118,20 @@ class _Ascii:
             return {p.name: table[:, i] for i, p in enumerate(element.properties)}, {}
         counts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_type}
         items: dict[str, list[int]] = {name: [] for name in counts}
+        scalars: dict[str, list[float]] = {p.name: [] for p in element.properties if p.name in _COLOURS}
         for row in rows:
             words = iter(row.split())
             for item in element.properties:
                 if not item.count_type:
-                    next(words, None)
+                    word = next(words, b"nan")
+                    if item.name in scalars:
+                        scalars[item.name].append(float(word))
                     continue
                 values = [float(w) for _, w in zip(range(int(next(words, b""))), words, strict=False)]
                 counts[item.name].append(len(values))
                 items[item.name] += map(int, values)
-        return {}, {n: (np.array(counts[n], dtype=np.int64), np.array(items[n], dtype=np.int64)) for n in counts}
+        lists = {n: (np.array(counts[n], dtype=np.int64), np.array(items[n], dtype=np.int64)) for n in counts}
+        return {n: np.array(values) for n, values in scalars.items()}, lists
 
 
 class _Binary:
@@ -124,12 +146,12 @@ class _Binary:
             table = self._take(np.dtype([(p.name, self._order + p.type) for p in element.properties]), element.count)
             return {p.name: table[p.name] for p in element.properties}, {}
         uniform = self._uniform(element) if len(lists) == 1 else None
-        return {}, uniform if uniform is not None else self._row_by_row(element)
+        return uniform if uniform is not None else self._row_by_row(element)
 
-    def _uniform(self, element: _Element) -> _Lists | None:
+    def _uniform(self, element: _Element) -> tuple[dict[str, np.ndarray], _Lists] | None:
         """Read all rows at once if all lists are as long as the first, as in triangle meshes; else None."""
         first = self._at
-        (name,) = self._row_by_row(_Element(element.name, min(element.count, 1), element.properties)).items()
+        (name,) = self._row_by_row(_Element(element.name, min(element.count, 1), element.properties))[1].items()
         self._at = first
         width = int(name[1][0][0]) if element.count else 0
         fields: list[tuple[str, str, tuple[int, ...]]] = []
@@ -144,11 +166,13 @@ class _Binary:
         if not (table[name[0] + " count"] == width).all():
             return None
         self._at += dtype.itemsize * element.count
-        return {name[0]: (np.full(element.count, width, np.int64), table[name[0]].reshape(-1).astype(np.int64))}
+        lists = {name[0]: (np.full(element.count, width, np.int64), table[name[0]].reshape(-1).astype(np.int64))}
+        return {p.name: table[p.name] for p in element.properties if not p.count_type}, lists
 
-    def _row_by_row(self, element: _Element) -> _Lists:
+    def _row_by_row(self, element: _Element) -> tuple[dict[str, np.ndarray], _Lists]:
         counts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_type}
         items: dict[str, list[np.ndarray]] = {name: [] for name in counts}
+        scalars: dict[str, list[np.ndarray]] = {p.name: [] for p in element.properties if not p.count_type}
         for _ in range(element.count):
             for p in element.properties:
                 if p.count_type:
@@ -156,9 +180,10 @@ class _Binary:
                     counts[p.name].append(count)
                     items[p.name].append(self._take(np.dtype(self._order + p.type), count))
                 else:
-                    self._take(np.dtype(self._order + p.type), 1)
+                    scalars[p.name].append(self._take(np.dtype(self._order + p.type), 1))
         empty = [np.zeros(0, np.int64)]
-        return {n: (np.array(counts[n], np.int64), np.concatenate(empty + items[n]).astype(np.int64)) for n in counts}
+        lists = {n: (np.array(counts[n], np.int64), np.concatenate(empty + items[n]).astype(np.int64)) for n in counts}
+        return {n: np.concatenate(empty + values) for n, values in scalars.items()}, lists
 
     def _take(self, dtype: np.dtype, count: int) -> np.ndarray:
         if count < 0 or dtype.itemsize * count > len(self._body) - self._at:

@@ -28,7 +28,7 @@ def read(data: bytes, nearby: Nearby = no_files) -> Soup:
     root = _parse(data)
     library = _Library(root, nearby)
     soup = soup_of(
-        (points, triangles, matrix, library.colour(bound.get(symbol, symbol)))
+        (points, triangles, matrix, library.colour(bound.get(symbol, symbol)), ())
         for geometry, matrix, bound in _instances(root, library)
         for points, triangles, symbol in library.primitives(geometry)
     )

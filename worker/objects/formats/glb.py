@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from typing import Any, Final
 
 import numpy as np
@@ -38,7 +39,8 @@ def read(data: bytes) -> Soup:
 
 def _parts(document: dict[str, Any], binary: bytes) -> Iterator[Part]:
     looks: dict[tuple[int, int], np.ndarray] = {}
-    for mesh, matrix in _instances(document):
+    for node, matrix in _instances(document):
+        mesh = int(node["mesh"])
         shown = _item(document, "meshes", mesh)
         _refuse_morphs(shown)
         for part, primitive in enumerate(shown["primitives"]):
@@ -48,7 +50,16 @@ def _parts(document: dict[str, Any], binary: bytes) -> Iterator[Part]:
             points, triangles = _primitive(document, binary, primitive)
             if (mesh, part) not in looks:
                 looks[mesh, part] = material_colour(document, binary, primitive)
-            yield points, triangles, matrix, looks[mesh, part]
+            yield points, triangles, matrix, looks[mesh, part], _names(document, node, shown, primitive)
+
+
+def _names(document: dict[str, Any], node: dict[str, Any], mesh: dict[str, Any], primitive: dict[str, Any]) -> Any:
+    """Return the names of a primitive: those of its node, mesh and material."""
+    material = {}
+    with suppress(LookupError, TypeError, ValueError):
+        material = document["materials"][int(primitive["material"])]
+    owners = (one for one in (node, mesh, material) if isinstance(one, dict))
+    return tuple(name for one in owners if isinstance(name := one.get("name"), str))
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -69,7 +80,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     return document, data[at + 8 : at + 8 + size]
 
 
-def _instances(document: dict[str, Any]) -> Iterator[tuple[int, np.ndarray]]:
+def _instances(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     nodes = _list(document, "nodes")
     scenes = _list(document, "scenes")
     if scenes:
@@ -87,7 +98,7 @@ def _instances(document: dict[str, Any]) -> Iterator[tuple[int, np.ndarray]]:
         if "skin" in node:
             raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without bones")
         if "mesh" in node:
-            yield int(node["mesh"]), matrix
+            yield node, matrix
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:

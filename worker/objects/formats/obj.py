@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Callable, Iterable
+from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -12,9 +13,10 @@ import numpy as np
 from graspd.service.model.errors import MeshError
 from graspd.service.model.transforms import Floats
 from graspd.service.store.mesh_files import MAX_NAMES, reference_of
-from graspd.worker.objects.formats.soup import Soup, check_face_count, triangulate
+from graspd.worker.objects.formats.soup import FaceNames, Soup, check_face_count, triangulate
 
 _SHADES = 8
+_MOST_GROUPS = 16
 _NO_COLOUR = [b"nan", b"nan", b"nan"]
 
 
@@ -29,6 +31,7 @@ def read(data: bytes, nearby: Nearby = no_files) -> Soup:
     vertices, shades = list[list[bytes]](), list[list[bytes]]()
     corners, counts = list[int](), list[int]()
     libraries, used = list[bytes](), list[tuple[int, bytes]]()
+    named, names = list[tuple[int, tuple[str, ...]]](), dict[bytes, list[str]]()
     for line in _lines(data):
         if line.startswith(b"v "):
             numbers = line.split(None, 7)[1:7]
@@ -43,8 +46,14 @@ def read(data: bytes, nearby: Nearby = no_files) -> Soup:
             counts.append(len(face))
             if len(counts) % 65536 == 0:
                 check_face_count(len(corners) - 2 * len(counts))
-        elif line.startswith(b"usemtl "):
-            used.append((len(counts), line[7:].strip()))
+        elif line.startswith((b"usemtl ", b"g ", b"o ")) or line == b"g":
+            kind, _, rest = line.partition(b" ")
+            text = rest.strip().decode(errors="replace")
+            # A face may be in several groups.
+            names[kind] = text.split()[:_MOST_GROUPS] if kind == b"g" else [text]
+            named.append((len(counts), tuple(chain(*names.values()))))
+            if kind == b"usemtl":
+                used.append((len(counts), rest.strip()))
         elif line.startswith(b"mtllib ") and len(libraries) < MAX_NAMES:
             libraries.append(line[7:].strip())
     points = np.array(vertices, dtype="S40").astype(float).reshape(-1, 3)
@@ -52,7 +61,10 @@ def read(data: bytes, nearby: Nearby = no_files) -> Soup:
     shown = _face_colours(shades, faces)
     if used and libraries:
         shown = _material_colours(used, libraries, nearby, np.array(counts, np.int64), shown)
-    return Soup(points, faces, shown)
+    triangles = np.concatenate([[0], np.cumsum(np.maximum(np.array(counts, np.int64) - 2, 0))])
+    bounds = triangles[[0, *(first for first, _ in named), len(counts)]]
+    found = FaceNames.of(zip(np.diff(bounds).tolist(), [(), *(some for _, some in named)], strict=True))
+    return Soup(points, faces, shown, names=found)
 
 
 def _material_colours(

@@ -10,6 +10,7 @@ import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.service.model.contact_region import is_part_name
 from graspd.service.model.errors import LimitError, MeshError
 from graspd.service.model.transforms import Floats
 from graspd.worker.objects.topology import face_vectors, join_meshes
@@ -27,6 +28,9 @@ class Soup:
     faces: NDArray[np.int64]
     colours: NDArray[np.float64] | None = None
     """(F, 3) sRGB colour of each face, 0 .. 1, NaN if not stated; None if no face has one."""
+    paint: NDArray[np.float64] | None = None
+    """(F, 3) colours that select faces but are not drawn; None: those of `colours`."""
+    names: FaceNames | None = None
 
     def by_colour(self) -> list[tuple[tuple[float, float, float] | None, NDArray[np.intp]]]:
         """Return each colour with the indices of its faces; faces without a colour are under None."""
@@ -40,11 +44,36 @@ class Soup:
         ]
 
 
+#: Largest number of sets of names in a mesh; faces of further sets have no name.
+MAX_PARTS: Final = 1000
+
+
+@dataclass(frozen=True)
+class FaceNames:
+    """Names of the parts of a mesh to which each face belongs."""
+
+    sets: tuple[tuple[str, ...], ...]
+    index: NDArray[np.int64]  # (F,) set of each face
+
+    @classmethod
+    def of(cls, runs: Iterable[tuple[int, Iterable[str]]]) -> FaceNames:
+        """Return the names of faces from runs: a number of faces, and their names."""
+        rows: dict[tuple[str, ...], int] = {(): 0}
+        counts, index = list[int](), list[int]()
+        for count, names in runs:
+            key = tuple(dict.fromkeys(filter(is_part_name, names)))
+            if len(rows) < MAX_PARTS:
+                rows.setdefault(key, len(rows))
+            counts.append(count)
+            index.append(rows.get(key, 0))
+        return cls(tuple(rows), np.repeat(np.array(index, np.int64), counts))
+
+
 _MAX_DEPTH: Final = 32
 _MAX_NODES: Final = 10_000
 Node = TypeVar("Node")
-#: Vertices (V, 3), triangles (F, 3), 4x4 matrix of the part's place, and its sRGB colour (3,), NaN if not stated.
-Part = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
+#: Vertices (V, 3), triangles (F, 3), 4x4 matrix of the part's place, sRGB colour (3,), NaN if not stated, and names.
+Part = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]
 
 
 def walk(
@@ -67,17 +96,19 @@ def soup_of(parts: Iterable[Part]) -> Soup:
     """Join the placed parts of a scene; mirrored ones are turned outward."""
     meshes: list[tuple[Floats, NDArray[np.int64]]] = []
     colours: list[Floats] = []
+    names = list[tuple[int, tuple[str, ...]]]()
     count = total = 0
-    for points, triangles, matrix, colour in parts:
+    for points, triangles, matrix, colour, named in parts:
         flipped = triangles[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else triangles
         meshes.append((points @ matrix[:3, :3].T + matrix[:3, 3], flipped))
         colours.append(np.tile(colour, (len(triangles), 1)))
+        names.append((len(triangles), named))
         count, total = count + len(points), total + len(triangles)
         check_face_count(max(total, count // 3))
     if not meshes:
         raise MeshError("the mesh has no faces; export a scene with a mesh")
     known = np.concatenate(colours)
-    return Soup(*join_meshes(meshes), None if np.isnan(known).all() else known)
+    return Soup(*join_meshes(meshes), None if np.isnan(known).all() else known, names=FaceNames.of(names))
 
 
 def check_soup(soup: Soup) -> Soup:

@@ -31,10 +31,14 @@ class Surface:
 
 @wp.struct
 class ContactRegions:
-    """Regions of the object, each an intersection of half-spaces (K,): n.x <= d as (n, d), origin: centre of mass."""
+    """Regions of the object: intersections of half-spaces (K,), and voxels without contact.
+    Half-spaces are n.x <= d as (n, d); the origin is the centre of mass."""
 
     allowed: wp.array(dtype=wp.vec4)  # contact only inside; empty: everywhere
     forbidden: wp.array(dtype=wp.vec4)  # no contact inside; empty: nowhere
+    closed: wp.array3d(dtype=wp.uint8)  # 1: no contact; empty: contact everywhere
+    origin: wp.vec3  # lowest corner of the first voxel
+    cell: wp.float32  # edge of a voxel [m]
     clearance: wp.float32  # distance that points without contact keep from the surface [m]
 
 
@@ -251,8 +255,19 @@ def is_inside(planes: wp.array(dtype=wp.vec4), x: wp.vec3):
 
 
 @wp.func
+def in_voxels(voxels: wp.array3d(dtype=wp.uint8), x: wp.vec3):
+    """Return the value of the voxel nearest to a place in units of voxels."""
+    i = wp.clamp(wp.int32(wp.floor(x[0])), 0, voxels.shape[0] - 1)
+    j = wp.clamp(wp.int32(wp.floor(x[1])), 0, voxels.shape[1] - 1)
+    k = wp.clamp(wp.int32(wp.floor(x[2])), 0, voxels.shape[2] - 1)
+    return voxels[i, j, k] != wp.uint8(0)
+
+
+@wp.func
 def is_forbidden(regions: ContactRegions, x: wp.vec3):
     """Check whether a place on the surface must not be touched."""
+    if regions.closed.shape[0] > 0 and in_voxels(regions.closed, (x - regions.origin) / regions.cell):
+        return True
     if regions.allowed.shape[0] > 0 and not is_inside(regions.allowed, x):
         return True
     return regions.forbidden.shape[0] > 0 and is_inside(regions.forbidden, x)
