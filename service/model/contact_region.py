@@ -31,7 +31,8 @@ def parse_region(text: str) -> list[Plane]:
 
 
 def parse_cone(text: str) -> tuple[tuple[float, float, float], float]:
-    """Parse `x, y, z, degrees` to an axis and the largest angle from it; raise ValueError for anything else."""
+    """Parse `x, y, z, degrees` to an axis and the largest angle from it.
+    Raises ValueError: another form, no direction, or an angle outside 1 to 180 degrees."""
     parts = [part.strip() for part in text.split(",")]
     if len(parts) == 4 and all(re.fullmatch(_NUMBER, part) for part in parts):
         x, y, z, degrees = map(float, parts)

@@ -31,7 +31,9 @@ class Surface:
 
 @wp.struct
 class ContactRegions:
-    """Regions of the object, each an intersection of half-spaces (K,): n.x <= d as (n, d), origin: centre of mass."""
+    """Regions of the object, each an intersection of half-spaces (K,): n.x <= d as (n, d).
+
+    Their origin is the centre of mass."""
 
     allowed: wp.array(dtype=wp.vec4)  # contact only inside; empty: everywhere
     forbidden: wp.array(dtype=wp.vec4)  # no contact inside; empty: nowhere
