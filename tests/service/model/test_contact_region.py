@@ -16,46 +16,38 @@ BOUNDS = st.lists(st.builds("{} {} {}".format, st.sampled_from("xyzw"), st.sampl
 @pytest.mark.parametrize(
     ("text", "planes"),
     [
-        ("z > 0.05", [(0, 0, -1, -0.05)]),
         ("z>0.05,x<.02", [(0, 0, -1, -0.05), (1, 0, 0, 0.02)]),
         (" y < -1e-3 ", [(0, 1, 0, -0.001)]),
-        ("x > +2.", [(-1, 0, 0, -2.0)]),
-        (", ".join(["z > 0"] * MOST_PLANES), [(0, 0, -1, 0.0)] * MOST_PLANES),
+        (", ".join(["x > +2."] * MOST_PLANES), [(-1, 0, 0, -2.0)] * MOST_PLANES),
     ],
 )
 def test_bounds_are_half_spaces(text: str, planes: list[tuple[float, ...]]) -> None:
     assert parse_region(text) == planes
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        *("", "z", "z > ", "w > 1", "z >= 1", "z > 1 mm", "1 < z", "z > 1,", "z > 1; x < 2", "z > 1 x < 2"),
-        *("z > nan", "z > inf", "z > 0x10", "z > 1_000", "z > ٣", "Z > 1", "z > 1\n# comment", "z > 1e999"),
-        ", ".join(["z > 0"] * (MOST_PLANES + 1)),
-    ],
-)
-def test_other_text_is_refused_as_a_region(text: str) -> None:
-    with pytest.raises(ValueError, match=r"bounds in metres, such as z > 0\.05") as error:
-        parse_region(text)
-    assert "\n" not in str(error.value)
-
-
 def test_cones_have_an_axis_and_an_angle() -> None:
     assert parse_cone("0, 0, -1, 30") == ((0, 0, -1), 30) and parse_cone("1,2,3,180") == ((1, 2, 3), 180)
 
 
+REGIONS = ["", "z", "w > 1", "z >= 1", "z > 1 mm", "1 < z", "z > 1,", "z > 1; x < 2", "z > nan", "z > inf", "z > 1_0"]
+REGIONS += ["z > ٣", "Z > 1", "z > 1\n# comment", "z > 1e999", ", ".join(["z > 0"] * (MOST_PLANES + 1))]
+CONES = ["", "0, 0, -1", "0, 0, 0, 30", "0, 0, -1, 0.5", "0, 0, -1, 181", "0, 0, -1, -30", "0, 0, -1, 30, 4"]
+CONES += ["a, b, c, d", "0, 0, nan, 30", "0, 0, 1e999, 30", "0, 0, 1e300, 30", "0 0 -1 30", "0, 0, -1, 30 deg"]
+
+
 @pytest.mark.parametrize(
-    "text",
-    [
-        *("", "0, 0, -1", "0, 0, 0, 30", "0, 0, -1, 0.5", "0, 0, -1, 181", "0, 0, -1, -30", "0, 0, -1, 30, 4"),
-        *("a, b, c, d", "0, 0, nan, 30", "0, 0, inf, 30", "0, 0, 1e999, 30", "0 0 -1 30", "0, 0, -1, 30 deg"),
-    ],
+    ("option", "text"), [*(("touch_region", t) for t in REGIONS), *(("approach_cone", t) for t in CONES)]
 )
-def test_other_text_is_refused_as_a_cone(text: str) -> None:
-    with pytest.raises(ValueError, match="an axis and an angle of 1 to 180 degrees") as error:
-        parse_cone(text)
+def test_other_text_is_refused_in_one_line(option: str, text: str) -> None:
+    parse, message = (
+        (parse_region, "in metres, such as z > 0") if option == "touch_region" else (parse_cone, "1 to 180")
+    )
+    with pytest.raises(ValueError, match=message) as error:
+        parse(text)
     assert "\n" not in str(error.value)
+    if text:
+        with pytest.raises(ValidationError):
+            JobOptions(**{option: text})
 
 
 @given(BOUNDS.map(", ".join) | st.lists(NUMBERS, min_size=4, max_size=4).map(", ".join) | st.text(max_size=40))
@@ -70,18 +62,18 @@ def test_hostile_text_is_parsed_to_moderate_numbers_or_refused_in_one_line(text:
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("options", "message"),
     [
-        *({name: text} for name in ("touch_region", "avoid_region") for text in ("up", "z > 1, " * 40)),
-        *({"approach_cone": text} for text in ("up", "0, 0, 0, 30", "0, " * 40)),
-        *({"digits": names} for names in (("pinky",), ("thumb",) * 7)),
-        {"type": "grip"},
-        *({"method": "dfc", **one} for one in ({"type": "pinch"}, {"digits": ("thumb", "index")})),
-        {"method": "dfc", "touch_region": "z > 0"},
+        ({"digits": ("pinky",)}, "thumb"),
+        ({"digits": ("thumb",) * 7}, "at most 6"),
+        ({"type": "grip"}, "any"),
+        ({"avoid_region": "z > 1, " * 40}, "at most 200"),
+        ({"method": "dfc", "type": "pinch"}, "method dfc plans any grasps: type requires method fast_graspd"),
+        ({"method": "dfc", "touch_region": "z > 0"}, "any grasps: touch-region requires method fast_graspd"),
     ],
 )
-def test_options_refuse_requirements_before_any_work(options: dict[str, object]) -> None:
-    with pytest.raises(ValidationError):
+def test_options_refuse_requirements_before_any_work(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
         JobOptions(**options)
 
 
@@ -90,5 +82,3 @@ def test_options_without_requirements_state_none_and_keep_the_ids_of_old_jobs() 
     assert plain.requirements == {} and not {"type", "digits", "touch_region"} & set(plain.model_dump())
     assert set(all_set.requirements) == {"type", "digits", "approach_cone"}
     assert JobOptions(type="any", digits=(), touch_region="") == plain
-    with pytest.raises(ValidationError, match="method dfc plans any grasps: touch-region requires method fast_graspd"):
-        JobOptions(method="dfc", touch_region="z > 0")

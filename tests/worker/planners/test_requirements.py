@@ -1,5 +1,6 @@
 """Requirements on grasps: starts, planned grasps and selection keep to type, digits, region and approach."""
 
+import json
 from functools import cache
 
 import numpy as np
@@ -11,9 +12,9 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.grasp_types import BALANCED
-from graspd.service.model.metrics import GraspType
 from graspd.service.model.transforms import quat_rotate
 from graspd.service.readers.where import compile_expression
+from graspd.service.store.manifests import _summaries
 from graspd.worker import generation
 from graspd.worker.batched_generation import validated_batches
 from graspd.worker.execution_context import ExecutionContext
@@ -68,12 +69,11 @@ def test_uniform_directions_are_uniform_in_the_cone_of_the_kernel(angle: float) 
     inputs = [wp.array(given, dtype=wp.vec3, device="cpu"), wp.vec3(*AXIS), float(np.cos(angle))]
     wp.launch(into_cones, len(given), inputs=inputs, outputs=[out], device="cpu")
     assert np.linalg.norm(out.numpy(), axis=1) == pytest.approx(1.0, abs=1e-5)
-    # Bands of equal height of a cap have equal areas; around the axis, directions keep their angle.
+    # Bands of equal height of a cap have equal areas.
     height = (1.0 - out.numpy() @ AXIS) / (1.0 - np.cos(angle))
     assert height.min() > -1e-4 and height.max() < 1 + 1e-4
     assert np.histogram(height, 5, (0, 1))[0] / len(given) == pytest.approx(0.2, abs=0.025)
-    aside = np.stack([out.numpy()[:, 0], out.numpy() @ [0, 0.8, 0.6]])
-    assert np.abs((aside > 0).mean(axis=1) - 0.5).max() < 0.03
+    assert (out.numpy()[:, 0] > 0).mean() == pytest.approx(0.5, abs=0.03)
 
 
 @pytest.mark.parametrize("angle", [0.2, 1.0, 2.5])
@@ -83,26 +83,21 @@ def test_directions_outside_a_cone_are_turned_inside_and_stay_apart(angle: float
     before, after = (np.arccos(np.clip(some @ AXIS, -1, 1)) for some in (given, found))
     np.testing.assert_allclose(after, np.where(before > angle, angle * before / np.pi, before), atol=1e-7)
     np.testing.assert_allclose(found[before <= angle], given[before <= angle], atol=1e-9)
-    assert np.linalg.norm(found, axis=1) == pytest.approx(1.0)
-    assert found[:2000].mean(axis=0) @ np.cross(AXIS, [1.0, 0, 0]) == pytest.approx(0.0, abs=0.05)
-    assert len(np.unique(found.round(6), axis=0)) > 1990
+    assert np.linalg.norm(found, axis=1) == pytest.approx(1.0) and len(np.unique(found.round(6), axis=0)) > 1990
 
 
-def approaches(hand: HandModel, rotation: np.ndarray) -> np.ndarray:
-    return quat_rotate(rotation, hand.palm.approach)
+def approaches(rotation: np.ndarray) -> np.ndarray:
+    return quat_rotate(rotation, HAND.palm.approach)
 
 
 def test_draws_of_the_kernel_approach_within_the_cone() -> None:
-    wanted = required(approach_cone=SIDE)
-    pair = pair_of(HAND, BAR.centred, DRAFT, "cpu")
-    seeds = np.arange(300, dtype=np.int32)
-    cosine = {}
-    for name, one in (("cone", wanted), ("any", NOTHING)):
+    wanted, pair = required(approach_cone=SIDE), pair_of(HAND, BAR.centred, DRAFT, "cpu")
+    drawn = []
+    for one in (wanted, NOTHING):
         sampling = ReachSampling.of(pair.model(pair.coarse), one)
-        state, number = sampling.starts(seeds, np.zeros(300, np.int32), np.array(RETREATS))
-        cosine[name] = (approaches(HAND, state.rotation) @ AXIS)[number >= 0]
-    assert len(cosine["cone"]) > 30 and cosine["cone"].min() >= np.cos(INNER * wanted.cone) - 1e-5
-    assert cosine["any"].min() < 0.0
+        state, number = sampling.starts(np.arange(300, dtype=np.int32), np.zeros(300, np.int32), np.array(RETREATS))
+        drawn.append((approaches(state.rotation) @ AXIS)[number >= 0])
+    assert len(drawn[0]) > 30 and drawn[0].min() >= np.cos(INNER * wanted.cone) - 1e-5 and drawn[1].min() < 0.0
 
 
 @pytest.mark.parametrize("place", ["free", "table"])
@@ -118,7 +113,7 @@ def test_palms_start_before_the_region_and_within_the_cone(place: str) -> None:
         model = pair.model(pair.coarse, DeviceObstacles.create(HAND, placed.scenes, obj.centre_of_mass, "cpu"))
         ways = [wanted.retreats(free_directions(placed.scenes[0], obj), placed, 0)]
         state, _ = clear_scene_starts(model, generators, each=2, placed=placed, ways=ways, wanted=wanted)
-    approach, axis = approaches(HAND, state.rotation), wanted.axes(placed if place == "table" else None, 12)[0]
+    approach, axis = approaches(state.rotation), wanted.axes(placed if place == "table" else None, 12)[0]
     assert (approach @ axis > np.cos(wanted.cone)).mean() >= 0.9
     # The ray from the palm comes near the upper part of the bar, z > 0.04 about its centre.
     along = state.pivot[:, None] + np.linspace(0, 0.25, 126)[:, None] * approach[:, None]
@@ -134,13 +129,11 @@ def planned(name: str, place: str = "free", **options: object) -> tuple[Requirem
     obj, wanted = OBJECTS[name].centred, required(OBJECTS[name], **options)
     scenes = on_tables(OBJECTS[name], count=2).centred(OBJECTS[name]) if place == "table" else None
     placed = scenes and scenes.placed(np.arange(COUNT) % 2)
-    request = PlanRequest(COUNT, DRAFT, seed=1, placed=placed, requirements=wanted)
-    found = synthesize(HAND, obj, request, TWO)
+    found = synthesize(HAND, obj, PlanRequest(COUNT, DRAFT, seed=1, placed=placed, requirements=wanted), TWO)
     columns = measure(HAND, obj, found, region=wanted.region)
-    axes = wanted.axes(placed, COUNT)
-    columns["cosine"] = (
-        np.zeros(COUNT) if axes is None else np.einsum("ni,ni->n", approaches(HAND, found.grasp.hand_pose[:, 3:]), axes)
-    )
+    if wanted.approach is not None:
+        axes, approach = wanted.axes(placed, COUNT), approaches(found.grasp.hand_pose[:, 3:])
+        columns["cosine"] = np.einsum("ni,ni->n", approach, axes)
     probe = probe_of(HAND, obj, hand_points=2000, object_points=3000)
     columns["touching"] = probe.body_distance(probe.measure(found.grasp)) < LINK_CONTACT_M
     return wanted, found, columns
@@ -205,7 +198,6 @@ def test_grasps_that_fail_a_requirement_are_rejected_and_counted(options: dict[s
 def test_without_requirements_nothing_is_rejected_for_them() -> None:
     made = validated_grasps(HAND, SMALL, candidates(budget=1), count=2)
     assert "requirements" not in made.rejected and "quality/region_share" not in made.columns
-    assert Requirements.of(JobOptions(type="any"), HAND) is NOTHING
 
 
 @pytest.mark.parametrize(
@@ -230,9 +222,8 @@ def test_what_cannot_be_fulfilled_is_refused_before_planning(hand, options, mess
 
 
 def test_a_cone_that_the_table_blocks_is_refused() -> None:
-    with pytest.raises(InputError, match="obstacles block every approach in the cone") as error:
+    with pytest.raises(InputError, match=r"^obstacles block every approach in the cone.*angle$"):
         planned("bar", "table", approach_cone="0, 0, 1, 40")
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("join", [1, 4])
@@ -251,9 +242,10 @@ def test_balanced_batches_have_the_types_in_turn_also_when_joined(join: int) -> 
 def test_requirements_and_contacts_are_written_and_chosen_by_expressions() -> None:
     options = candidates(type="pinch", grasps=2, touch_region="z > 0.02", budget=20)
     made = synthesize_grasps("allegro", "block", options)
-    assert made.attributes["requirements"] == '{"type":"pinch","touch_region":"z > 0.02"}'
+    assert json.loads(made.attributes["requirements"]) == {"type": "pinch", "touch_region": "z > 0.02"}
     assert (made.arrays["quality/digits"] == 0b11).all() and (made.arrays["quality/taxonomy_type"] == 9).all()
     count = len(made.arrays["quality/valid"])
     for text, chosen in (("digits = 3 and taxonomy_type = 9 and region_share >= 0.95", count), ("digits != 3", 0)):
-        assert compile_expression(text)(made.arrays, {}).sum() == chosen > -1
-    assert count > 0 and (made.arrays["quality/grasp_type"] == GraspType.PRECISION).all()
+        assert compile_expression(text)(made.arrays, {}).sum() == chosen
+    summaries = _summaries(made.arrays, made.attributes)[1]
+    assert count == len(summaries) > 0 and {(one.digits, one.taxonomy_type) for one in summaries} == {(3, 9)}
