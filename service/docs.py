@@ -84,19 +84,18 @@ def keywords_stub() -> str:
         parts += [
             "",
             f"class {title}(TypedDict, total=False):",
-            *(_stub_line(row.name, text) for row, text in keywords),
+            *(_keyword_line(row.name, text) for row, text in keywords),
         ]
     return "\n".join(parts) + "\n"
 
 
-def _stub_line(name: str, text: str) -> str:
-    """Return a keyword's line; long lists of choices have one choice a line, as the formatter writes them."""
+def _keyword_line(name: str, text: str) -> str:
+    """Return the line of a keyword, wrapped as by ruff."""
     line = f"    {name}: {text}"
-    return line if len(line) <= 120 else re.sub(r"\[(.*)]$", lambda m: _column(m[1]), line)
-
-
-def _column(choices: str) -> str:
-    return "[\n" + "".join(f"        {choice},\n" for choice in choices.split(", ")) + "    ]"
+    if len(line) <= _WIDTH:
+        return line
+    head, choices = line.removesuffix("]").split("[", 1)
+    return "\n        ".join([f"{head}[", *(f"{choice}," for choice in choices.split(", "))]) + "\n    ]"
 
 
 PARTS: Final[dict[str, Callable[[], str]]] = {
@@ -110,6 +109,7 @@ PARTS: Final[dict[str, Callable[[], str]]] = {
 }
 PAGES: Final = tuple(f"docs/reference/{name}.md" for name in ("settings", "dataset", "metrics", "options"))
 STUB: Final = "graspd/keywords.pyi"
+_WIDTH: Final = 120
 
 
 def update_tables(text: str) -> str:

@@ -10,7 +10,9 @@ from typing import Final
 Plane = tuple[float, float, float, float]
 
 MOST_PLANES: Final = 12
-_NUMBER: Final = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+#: Largest number in a region or a cone; larger ones overflow in single precision.
+LARGEST: Final = 1e6
+_NUMBER: Final = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _BOUND: Final = re.compile(rf"([xyz])\s*([<>])\s*({_NUMBER})")
 
 
@@ -46,15 +48,15 @@ def parse_region(text: str) -> RegionSpec:
         return RegionSpec(colour=f"#{colour[1].lower()}")
     if (part := _PART.fullmatch(text.strip())) is not None and is_part_name(part[1]):
         return RegionSpec(part=part[1])
-    found = [_BOUND.fullmatch(bound.strip()) for bound in text.split(",")]
-    if not 1 <= len(found) <= MOST_PLANES or None in found:
+    bounds = text.split(",")
+    found = [one for part in bounds if (one := _BOUND.fullmatch(part.strip())) and abs(float(one[3])) <= LARGEST]
+    if len(found) < len(bounds) or len(bounds) > MOST_PLANES:
         raise ValueError(
             f"a region is up to {MOST_PLANES} bounds in metres, such as z > 0.05, x < 0.02; or part NAME; or "
             f"color #rrggbb; got {text!r}"
         )
     planes = list[Plane]()
     for match in found:
-        assert match is not None
         axis, sign = "xyz".index(match[1]), 1.0 if match[2] == "<" else -1.0
         x, y, z = (sign if k == axis else 0.0 for k in range(3))
         planes.append((x, y, z, sign * float(match[3])))
@@ -62,11 +64,12 @@ def parse_region(text: str) -> RegionSpec:
 
 
 def parse_cone(text: str) -> tuple[tuple[float, float, float], float]:
-    """Parse `x, y, z, degrees` to an axis and the largest angle from it; raise ValueError for anything else."""
+    """Parse `x, y, z, degrees` to an axis and the largest angle from it.
+    Raises ValueError: another form, no direction, or an angle outside 1 to 180 degrees."""
     parts = [part.strip() for part in text.split(",")]
     if len(parts) == 4 and all(re.fullmatch(_NUMBER, part) for part in parts):
         x, y, z, degrees = map(float, parts)
-        if math.hypot(x, y, z) > 1e-6 and 1.0 <= degrees <= 180.0:
+        if 1e-6 < math.hypot(x, y, z) <= LARGEST and 1.0 <= degrees <= 180.0:
             return (x, y, z), degrees
     raise ValueError(
         f"a cone is an axis and an angle of 1 to 180 degrees, such as 0, 0, -1, 30 (from above); got {text!r}"

@@ -22,7 +22,9 @@ from graspd.service.model.metrics import GRASP_METRICS, GraspType
 
 LONGEST: Final = 1000
 _DEEPEST: Final = 40
-_METRICS: Final = {metric.name: metric for metric in GRASP_METRICS if not metric.code}
+#: Codes that expressions compare as numbers.
+_NUMBERS: Final = ("taxonomy_type", "digits")
+_METRICS: Final = {metric.name: metric for metric in GRASP_METRICS if not metric.code or metric.name in _NUMBERS}
 _SHORT: Final = {"robust": "robust_share"}
 _WORDS: Final = ("hand", "object", "type")
 _TYPES: Final = tuple(kind.name.lower() for kind in GraspType)
@@ -41,7 +43,7 @@ class Flag:
 
 @dataclass(frozen=True)
 class MetricComparison:
-    """Comparison of a numeric metric (not a code) with a number."""
+    """Comparison of a metric with a number."""
 
     name: str
     op: str

@@ -93,7 +93,8 @@ def points_of_parts(hand: HandModel, parts: NDArray[np.int32], points: SurfacePo
 
 
 def hand_with_digits(hand: HandModel, names: Sequence[str]) -> HandModel:
-    """Return the hand with fingertips of the named digits only; joints of the other digits are locked open.
+    """Return the hand with fingertips of the named digits only.
+    Joints of the other digits are locked open.
     Raises InputError: an unknown digit, or fewer than two."""
     known = digit_names(hand)
     if not known:

@@ -20,6 +20,7 @@ from graspd.service.model.transforms import Floats, quat_conjugate, quat_rotate
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.digits import NAMES, Part, digit_names, digit_order, finger_of_body, hand_with_digits
 from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.pinch_postures import require_opposing
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.parts import Voxels, voxels_of
 from graspd.worker.objects.region import WHOLE, ContactRegion
@@ -66,7 +67,8 @@ class Requirements:
         """
         kind: str = request.type
         if kind == "balanced":
-            kinds = [name for name in BALANCED if digit_names(hand) or not RULES[name].digits]
+            has_thumb = "thumb" in (request.digits or digit_names(hand))
+            kinds = [name for name in BALANCED if has_thumb or not RULES[name].digits]
             kind = kinds[batch % len(kinds)]
         rule, digits = RULES.get(kind), tuple[str, ...](request.digits)
         if rule is not None and rule.digits and not digits:
@@ -98,14 +100,18 @@ class Requirements:
         return max(2, self.rule.digits if self.rule else 0)
 
     def check(self, hand: HandModel, obj: ObjectModel) -> None:
-        """Raise InputError if the hand has too few digits, or the object no surface in the region."""
+        """Raise InputError: the hand has too few digits, the object no surface in the region.
+        Raises HandError: the digits do not oppose."""
         rule, names = self.rule, digit_names(hand)
         if rule is not None and rule.digits > len(names):
             count = f"has {len(names)}" if names else "is a gripper"
             raise InputError(
                 f"type {self.type} needs {rule.digits} digits, and {hand.name} {count}: choose power or precision"
             )
-        self.hand(hand)
+        if rule is not None and rule.digits and ("thumb" not in self.digits or rule.digits > len(self.digits)):
+            given = ", ".join(self.digits)
+            raise InputError(f"type {self.type} needs {rule.digits} digits with the thumb; digits name {given}")
+        require_opposing(self.hand(hand))
         if not self.region.is_whole:
             region_points(obj, self.region)
 
@@ -154,7 +160,8 @@ class Requirements:
         return np.asarray(turned[placed.index])
 
     def retreats(self, ways: Floats, scenes: PlacedGrasps, scene: int) -> Floats:
-        """Select the free directions of retreat (K, 3) of a scene with approaches in the inner part of the cone.
+        """Select the directions of retreat (K, 3) with approaches in the inner part of the cone.
+        `ways` are the free directions of scene number `scene`.
         Raises InputError: obstacles block the cone."""
         if self.approach is None:
             return ways

@@ -47,7 +47,9 @@ MEDIUM_M: Final = (0.03, 0.06)
 
 @dataclass(frozen=True)
 class ContactPattern:
-    """Contacts of B grasps by digit. The F digits are in the order of `digit_order`: the thumb, if any, is first."""
+    """Contacts of B grasps by digit.
+
+    The F digits are in the order of `digit_order`: the thumb, if any, is first."""
 
     palm: Mask
     """(B,) whether the palm touches."""

@@ -117,6 +117,16 @@ def test_grasps_page_through_in_the_order_of_any_metric(services: Services) -> N
         assert values[: len(known)] == known, f"{sort}: those without the metric come last"
 
 
+def test_grasps_are_chosen_by_their_contacts(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=32))
+    finish(services, job.id)
+    contacts = {"taxonomy_type": 14, "digits": 7, "region_share": 0.97}
+    with services.index.database.write_transaction() as connection:
+        connection.execute(update(tables.grasps).where(tables.grasps.c.row < 3).values(contacts))
+    where = GraspFilter(where="taxonomy_type = 14 and digits = 7 and region_share >= 0.95")
+    assert [one.model_dump(include=set(contacts)) for one in all_pages(services, where, limit=9)] == [contacts] * 3
+
+
 def test_failures_are_grouped_by_stage_and_error(services: Services) -> None:
     job, _ = job_actions.submit(services, request(grasps=64))
     fail(services, job.id, 0, 1, last=False)

@@ -9,7 +9,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation import kernels
 from graspd.worker.simulation.data import Data, Schedule
 from graspd.worker.simulation.device import DeviceHand, DeviceObject
-from graspd.worker.simulation.model import LossOptions, Model
+from graspd.worker.simulation.model import ANYWHERE, AllowedContacts, LossOptions, Model
 from graspd.worker.simulation.sampling import object_samples
 from tests.worker.models import object_from_mesh
 
@@ -23,12 +23,19 @@ def still(dilation: float = 0.0, weight: float = 0.0) -> Schedule:
 
 
 def rig(
-    hand: HandModel, obj: ObjectModel, *, capacity: int, options: LossOptions | None = None, alpha: float = 0.5
+    hand: HandModel,
+    obj: ObjectModel,
+    *,
+    capacity: int,
+    options: LossOptions | None = None,
+    alpha: float = 0.5,
+    allowed: AllowedContacts = ANYWHERE,
 ) -> tuple[Model, Data]:
     kernels.load("cpu")
     device_object = DeviceObject.create(obj, "cpu", samples=object_samples(obj, 1000), phong_alpha=alpha, cell=0.0)
     points = sample_surface(hand, 300)
-    model = Model.create(DeviceHand.create(hand, "cpu"), device_object, points, points, options or LossOptions())
+    on_device = DeviceHand.create(hand, "cpu")
+    model = Model.create(on_device, device_object, points, points, options or LossOptions(), allowed=allowed)
     data = Data(model, capacity)
     data.set_schedule(still())
     return model, data

@@ -130,7 +130,7 @@ def draw_starts(pair: _Pair, generators: list[np.random.Generator]) -> tuple[Han
 
 
 def into_cone(approach: Floats, axis: Floats, angle: float) -> Floats:
-    """Return unit vectors (n, 3); those outside the cone about `axis` (3,) are turned to an angle inside [rad].
+    """Turn unit vectors (n, 3) outside the cone about `axis` (3,) to an angle inside [rad].
     An angle of a above `angle` becomes `angle` a / pi, so that the directions stay different from each other."""
     cosine = approach @ axis
     between = np.arccos(np.clip(cosine, -1.0, 1.0))

@@ -85,4 +85,4 @@ def attract(pull_in: wp.float32, length_in: wp.float32, hands_in: Hands, contact
     rho = contacts_inout.distance[b, i]
     contacts_inout.gradient[b, i] = 0.0
     if rho > 0.0:
-        contacts_inout.gradient[b, i] = pull_in * contacts_inout.weight[b, i] * wp.exp(-rho / length_in)
+        contacts_inout.gradient[b, i] = pull_in * wp.max(contacts_inout.weight[b, i], 0.0) * wp.exp(-rho / length_in)

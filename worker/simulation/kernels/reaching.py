@@ -71,7 +71,8 @@ def clear_of(surface: Surface, grips: Grips, posture: wp.int32, pivot: wp.vec3, 
 
 @wp.func
 def into_cone(direction: wp.vec3, axis: wp.vec3, cosine: wp.float32):
-    """Return a unit vector in the cone about `axis`; directions uniform on the sphere become uniform in the cone."""
+    """Return a unit vector in the cone about `axis`.
+    Directions uniform on the sphere become uniform in the cone."""
     along = wp.dot(direction, axis)
     aside = direction - along * axis
     height = cosine + (1.0 - cosine) * 0.5 * (along + 1.0)

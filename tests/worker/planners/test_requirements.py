@@ -1,0 +1,254 @@
+"""Requirements on grasps: starts, planned grasps and selection keep to type, digits, region and approach."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import InputError
+from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.grasp_types import BALANCED
+from graspd.service.model.transforms import quat_rotate
+from graspd.service.readers.where import compile_expression
+from graspd.service.store.manifests import _summaries
+from graspd.worker import generation
+from graspd.worker.batched_generation import validated_batches
+from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.files.synthesis import synthesize_grasps
+from graspd.worker.generation import validated_grasps
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.digits import hand_with_digits
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
+from graspd.worker.planners import PlanRequest, synthesize
+from graspd.worker.planners.fast_graspd import starts
+from graspd.worker.planners.fast_graspd.antipodal_starts import ReachSampling, crossings_of
+from graspd.worker.planners.fast_graspd.pairs import pair_of
+from graspd.worker.planners.fast_graspd.scene_starts import EVERY, REACHING, clear_scene_starts, free_directions
+from graspd.worker.planners.fast_graspd.starts import RETREATS, clear_starts, start_generator
+from graspd.worker.planners.requirements import INNER, LEAST_SHARE, NOTHING, Requirements
+from graspd.worker.quality.contact import LINK_CONTACT_M
+from graspd.worker.quality.probe import probe_of
+from graspd.worker.quality.table import measure
+from graspd.worker.simulation.kernels import reaching
+from graspd.worker.simulation.obstacles import DeviceObstacles
+from tests.worker.hands.urdfs import gripper
+from tests.worker.models import assert_same_batch, object_from_mesh, on_tables, unit_vectors
+
+COUNT = 8
+DRAFT, TWO = FIDELITIES["draft"], ExecutionContext(threads=2)
+SMALL = object_from_mesh(trimesh.creation.icosphere(subdivisions=3, radius=0.02))
+#: A bar that stands on z = 0.
+BAR = object_from_mesh(trimesh.creation.box((0.04, 0.04, 0.14))).place_at((0.0, 0.0, 0.07))
+OBJECTS = {"ball": SMALL, "bar": BAR}
+HAND = hand_from_path("allegro")
+AXIS = np.array([0.0, 0.6, -0.8])
+SIDE, ABOVE = "0, 0.6, -0.8, 30", "0, 0, -1, 30"
+
+
+def required(obj=BAR, hand: HandModel = HAND, batch: int = 0, **options: object) -> Requirements:
+    found = Requirements.of(JobOptions(**options), hand, batch, origin=obj.centre)
+    found.check(hand, obj.centred)
+    return found
+
+
+@wp.kernel
+def into_cones(given: wp.array(dtype=wp.vec3), axis: wp.vec3, cosine: float, out: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    out[i] = reaching.into_cone(given[i], axis, cosine)
+
+
+@pytest.mark.parametrize("angle", [0.1, 0.5, 1.5, 3.0])
+def test_uniform_directions_are_uniform_in_the_cone_of_the_kernel(angle: float) -> None:
+    given = unit_vectors(np.random.default_rng(0), 4000)
+    out = wp.empty(len(given), dtype=wp.vec3, device="cpu")
+    inputs = [wp.array(given, dtype=wp.vec3, device="cpu"), wp.vec3(*AXIS), float(np.cos(angle))]
+    wp.launch(into_cones, len(given), inputs=inputs, outputs=[out], device="cpu")
+    assert np.linalg.norm(out.numpy(), axis=1) == pytest.approx(1.0, abs=1e-5)
+    # Bands of equal height of a cap have equal areas.
+    height = (1.0 - out.numpy() @ AXIS) / (1.0 - np.cos(angle))
+    assert height.min() > -1e-4 and height.max() < 1 + 1e-4
+    assert np.histogram(height, 5, (0, 1))[0] / len(given) == pytest.approx(0.2, abs=0.025)
+    assert (out.numpy()[:, 0] > 0).mean() == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.parametrize("angle", [0.2, 1.0, 2.5])
+def test_directions_outside_a_cone_are_turned_inside_and_stay_apart(angle: float) -> None:
+    given = np.concatenate([unit_vectors(np.random.default_rng(1), 2000), [AXIS, -AXIS]])
+    found = starts.into_cone(given, AXIS, angle)
+    before, after = (np.arccos(np.clip(some @ AXIS, -1, 1)) for some in (given, found))
+    np.testing.assert_allclose(after, np.where(before > angle, angle * before / np.pi, before), atol=1e-7)
+    np.testing.assert_allclose(found[before <= angle], given[before <= angle], atol=1e-9)
+    assert np.linalg.norm(found, axis=1) == pytest.approx(1.0) and len(np.unique(found.round(6), axis=0)) > 1990
+
+
+def approaches(rotation: np.ndarray) -> np.ndarray:
+    return quat_rotate(rotation, HAND.palm.approach)
+
+
+def test_draws_of_the_kernel_approach_within_the_cone() -> None:
+    wanted, pair = required(approach_cone=SIDE), pair_of(HAND, BAR.centred, DRAFT, "cpu")
+    drawn = []
+    for one in (wanted, NOTHING):
+        sampling = ReachSampling.of(pair.model(pair.coarse), one)
+        state, number = sampling.starts(np.arange(300, dtype=np.int32), np.zeros(300, np.int32), np.array(RETREATS))
+        drawn.append((approaches(state.rotation) @ AXIS)[number >= 0])
+    assert len(drawn[0]) > 30 and drawn[0].min() >= np.cos(INNER * wanted.cone) - 1e-5 and drawn[1].min() < 0.0
+
+
+@pytest.mark.parametrize("place", ["free", "table"])
+def test_palms_start_before_the_region_and_within_the_cone(place: str) -> None:
+    obj, free = BAR.centred, place == "free"
+    wanted = required(touch_region="z > 0.11", approach_cone=SIDE if free else ABOVE)
+    placed = on_tables(BAR, count=1).centred(BAR).placed(np.zeros(12, int))
+    pair = pair_of(HAND, obj, DRAFT, "cpu", in_scenes=not free)
+    generators = [start_generator(3, 0, i, k) for i in range(12) for k in range(EVERY)]
+    if free:
+        state, _ = clear_starts(pair.model(pair.coarse), generators, each=EVERY, wanted=wanted)
+    else:
+        model = pair.model(pair.coarse, DeviceObstacles.create(HAND, placed.scenes, obj.centre_of_mass, "cpu"))
+        ways = [wanted.retreats(free_directions(placed.scenes[0], obj), placed, 0)]
+        state, _ = clear_scene_starts(model, generators, each=EVERY, placed=placed, ways=ways, wanted=wanted)
+    approach, axis = approaches(state.rotation), wanted.axes(None if free else placed, 12)[0]
+    assert (approach @ axis > np.cos(INNER * wanted.cone if free else wanted.cone) - 1e-6).mean() >= (
+        1 if free else 0.9
+    )
+    # Rays from palms to single points meet the upper part of the bar; those to pairs of points pass near it.
+    along = state.pivot[:, None] + np.linspace(0, 0.25, 251)[:, None] * approach[:, None]
+    off = np.linalg.norm(np.maximum(np.abs(along - [0, 0, 0.055]) - [0.02, 0.02, 0.015], 0), axis=-1).min(axis=1)
+    number = np.arange(len(off)) % EVERY
+    assert off[number % 2 == 0 if free else number >= REACHING].max() < 1e-3 and off.max() < 0.05
+    for end in crossings_of(obj, wanted.region).ends():
+        assert len(end) and (end[:, 2] > 0.04 - 1e-9).all()
+
+
+@cache
+def planned(name: str, place: str = "free", **options: object) -> tuple[Requirements, GraspSet, dict[str, np.ndarray]]:
+    """Grasps straight from the planner, without selection, and their measures."""
+    obj, wanted = OBJECTS[name].centred, required(OBJECTS[name], **options)
+    scenes = on_tables(OBJECTS[name], count=2).centred(OBJECTS[name]) if place == "table" else None
+    placed = scenes and scenes.placed(np.arange(COUNT) % 2)
+    found = synthesize(HAND, obj, PlanRequest(COUNT, DRAFT, seed=1, placed=placed, requirements=wanted), TWO)
+    columns = measure(HAND, obj, found, region=wanted.region)
+    if wanted.approach is not None:
+        axes, approach = wanted.axes(placed, COUNT), approaches(found.grasp.hand_pose[:, 3:])
+        columns["cosine"] = np.einsum("ni,ni->n", approach, axes)
+    probe = probe_of(HAND, obj, hand_points=2000, object_points=3000)
+    columns["touching"] = probe.body_distance(probe.measure(found.grasp)) < LINK_CONTACT_M
+    return wanted, found, columns
+
+
+@pytest.mark.parametrize("options", [{"type": "precision"}, {"type": "pinch"}], ids=str)
+def test_planned_precision_grasps_touch_with_the_fingertips_only(options: dict[str, object]) -> None:
+    tips = np.isin(np.arange(HAND.bodies), HAND.fingertips)
+    touching = planned("ball", **options)[2]["touching"]
+    assert not touching[:, ~tips].any() and (touching[:, tips].sum(axis=1) >= 2).all()
+    assert planned("ball")[2]["touching"][:, ~tips].any(axis=1).mean() > 0.5, "without a requirement, palms touch"
+
+
+@pytest.mark.parametrize("options", [{"type": "pinch"}, {"digits": ("thumb", "index")}], ids=str)
+def test_unused_digits_stay_locked_and_do_not_touch(options: dict[str, object]) -> None:
+    _, found, columns = planned("ball", **options)
+    locked = hand_with_digits(HAND, ("thumb", "index"))
+    q = HAND.reduce(found.grasp.joint_positions)
+    assert ((q >= locked.lower - 1e-5) & (q <= locked.upper + 1e-5)).all()
+    assert not (columns["quality/digits"] & ~0b11).any() and (planned("ball")[2]["quality/digits"] & ~0b11).any()
+
+
+@pytest.mark.parametrize(("place", "cone"), [("free", SIDE), ("free", ABOVE), ("table", ABOVE)])
+def test_planned_grasps_approach_within_the_cone(place: str, cone: str) -> None:
+    wanted, _, columns = planned("bar", place, approach_cone=cone)
+    assert (columns["cosine"] >= np.cos(wanted.cone)).mean() >= 0.75
+    assert (columns["quality/contact_links"] >= 2).all()
+
+
+@pytest.mark.parametrize("options", [{"touch_region": "z > 0.09"}, {"avoid_region": "z > 0.09"}], ids=str)
+def test_planned_grasps_touch_in_the_region(options: dict[str, str]) -> None:
+    wanted, found, columns = planned("bar", **options)
+    assert (columns["quality/region_share"] >= LEAST_SHARE).mean() >= 0.75
+    other = measure(HAND, BAR.centred, planned("bar")[1], region=wanted.region)["quality/region_share"]
+    assert (other < LEAST_SHARE).mean() >= 0.5 and len(found) == COUNT
+
+
+def candidates(**options: object) -> JobOptions:
+    return JobOptions(fidelity="draft", validation="none", rechecks=0, **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "outcome"),
+    [
+        ({"type": "power", "approach_cone": "0, 0, -1, 180"}, "other_type"),
+        ({"type": "palmar_pinch"}, "other_type"),
+        ({"touch_region": "z > 0.02, x > 0"}, "outside_region"),
+        ({"approach_cone": "0, 1, 0, 8"}, "other_approach"),
+    ],
+)
+def test_grasps_that_fail_a_requirement_are_rejected_and_counted(options: dict[str, str], outcome: str) -> None:
+    made = validated_grasps(HAND, SMALL if outcome == "other_type" else BAR, candidates(**options, budget=3), count=6)
+    wanted = required(SMALL if outcome == "other_type" else BAR, **options)
+    assert made.outcomes[outcome] > 0 and made.rejected["requirements"] >= made.outcomes[outcome]
+    assert made.candidates == len(made.grasps) + sum(made.rejected.values())
+    assert (wanted.failed(HAND, made.grasps.grasp, None, made.columns) == "").all()
+    if wanted.rule is not None:
+        assert (made.columns["quality/grasp_type"] == wanted.rule.kind).all()
+    assert ("quality/region_share" in made.columns) == ("touch_region" in options)
+
+
+def test_without_requirements_nothing_is_rejected_for_them() -> None:
+    made = validated_grasps(HAND, SMALL, candidates(budget=1), count=2)
+    assert "requirements" not in made.rejected and "quality/region_share" not in made.columns
+
+
+@pytest.mark.parametrize(
+    ("hand", "options", "message"),
+    [
+        ("gripper", {"type": "pinch"}, "needs 2 digits, and .* is a gripper: choose power or precision"),
+        ("gripper", {"digits": ("thumb", "index")}, "no digits to choose"),
+        ("barrett", {"type": "quadpod"}, "needs 4 digits, and barrett has 3"),
+        ("allegro", {"digits": ("thumb", "little")}, "no little"),
+        ("allegro", {"type": "tripod", "digits": ("thumb", "index")}, "needs 3 digits with the thumb"),
+        ("allegro", {"type": "pinch", "digits": ("index", "middle")}, "needs 2 digits with the thumb"),
+        ("allegro", {"touch_region": "z > 5"}, "no surface in the region"),
+        ("allegro", {"touch_region": "z > 0.1", "avoid_region": "z > 0.05"}, "no surface in the region"),
+    ],
+)
+def test_what_cannot_be_fulfilled_is_refused_before_planning(hand, options, message, monkeypatch) -> None:
+    monkeypatch.setattr(generation, "synthesize", None)
+    model = gripper() if hand == "gripper" else hand_from_path(hand)
+    with pytest.raises(InputError, match=message) as error:
+        validated_grasps(model, BAR, candidates(**options), count=2)
+    assert "\n" not in str(error.value)
+
+
+def test_a_cone_that_the_table_blocks_is_refused() -> None:
+    with pytest.raises(InputError, match=r"^obstacles block every approach in the cone.*angle$"):
+        planned("bar", "table", approach_cone="0, 0, 1, 40")
+
+
+@pytest.mark.parametrize("join", [1, 4])
+def test_balanced_batches_have_the_types_in_turn_also_when_joined(join: int) -> None:
+    request = candidates(type="balanced", want="candidates")
+    made = validated_batches(HAND, SMALL, request, sizes=[2] * 4, join=join, run=TWO)
+    for batch, one in enumerate(made):
+        kind = BALANCED[batch % 3]
+        assert required(batch=batch, type="balanced").type == kind
+        alone = candidates(type=kind, want="candidates")
+        assert_same_batch(one, validated_grasps(HAND, SMALL, alone, count=2, batch=batch, run=TWO))
+    kinds = [required(hand=gripper(), batch=batch, type="balanced").type for batch in range(4)]
+    assert kinds == ["power", "precision"] * 2, "a gripper has no pinch"
+
+
+def test_requirements_and_contacts_are_written_and_chosen_by_expressions() -> None:
+    options = candidates(type="pinch", grasps=2, touch_region="z > 0.02", budget=20)
+    made = synthesize_grasps("allegro", "block", options)
+    assert json.loads(made.attributes["requirements"]) == {"type": "pinch", "touch_region": "z > 0.02"}
+    assert (made.arrays["quality/digits"] == 0b11).all() and (made.arrays["quality/taxonomy_type"] == 9).all()
+    count = len(made.arrays["quality/valid"])
+    for text, chosen in (("digits = 3 and taxonomy_type = 9 and region_share >= 0.95", count), ("digits != 3", 0)):
+        assert compile_expression(text)(made.arrays, {}).sum() == chosen
+    summaries = _summaries(made.arrays, made.attributes)[1]
+    assert count == len(summaries) > 0 and {(one.digits, one.taxonomy_type) for one in summaries} == {(3, 9)}
