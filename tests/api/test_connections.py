@@ -122,8 +122,7 @@ def test_a_forwarded_address_is_believed_only_where_allowed(
     if believed:
         monkeypatch.setenv("FORWARDED_ALLOW_IPS", believed)
     forwarded = b"X-Forwarded-For: 192.0.2.7\r\nConnection: close\r\n\r\n"
-    connection = connect(_WHOLE.removesuffix(b"\r\n") + forwarded)
-    assert rest(connection).endswith(b"\r\n\r\n" + seen)
+    assert rest(connect(_WHOLE.removesuffix(b"\r\n") + forwarded)).endswith(b"\r\n\r\n" + seen)
 
 
 def test_head_of_a_stream_that_never_ends_does(app: FastAPI, connect: Connect) -> None:

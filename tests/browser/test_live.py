@@ -13,8 +13,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.store.records import publish_record
-from tests.api.dashboard.test_stability_page import a_record
-from tests.api.dashboard.test_tradeoff import RUNS
+from tests.api.dashboard.test_tradeoff import RUNS, a_record
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
 from tests.fakes import plan_all, record_of
 from tests.waiting import until

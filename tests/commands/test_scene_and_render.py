@@ -1,12 +1,15 @@
-"""`graspd scene`, `graspd render` and `graspd pictures` on files, without queue or server."""
+"""`graspd scene`, `render`, `pictures`, `hands check` and `objects check` on files, without queue or server."""
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
+from typer.testing import CliRunner
 
+from graspd.cli import build_app
 from graspd.commands import grasp_sheet, render
 from graspd.commands.grasp_sheet import AFTER_S, BEFORE_S
 from graspd.exchange.robots.execution import SHORTEST_S
@@ -14,6 +17,7 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.shards import json_attribute, read_shard, write_shard
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.rendering import portraits
 from tests.worker.commands_run import graspd, refused
 from tests.worker.models import attributes_of, quality_columns
 
@@ -47,8 +51,7 @@ def test_each_grasp_is_in_each_scene_and_each_placement_a_stereo_pair(scene_shar
     assert shard["grasp/base_index"].tolist() == [0, 1, 2, 0, 1, 2]
     assert (shard.attributes["object"], shard.attributes["seed"]) == ("block", 5)
     output, page = scene_shard.with_name("views.h5"), scene_shard.with_name("views.png")
-    found = graspd(f"render --views 2 --stereo {SMALL} -o", output, "--page", page, scene_shard)
-    assert found["pictures"] == 8
+    assert graspd(f"render --views 2 --stereo {SMALL} -o", output, "--page", page, scene_shard)["pictures"] == 8
     assert read_shard(output, kind="views")["image/rgb"].shape == (8, 36, 48, 3)
     with Image.open(page) as image:
         assert image.size[1] > 4 * 36
@@ -154,8 +157,7 @@ def test_render_writes_the_channels_cameras_and_hand_asked_for(base, scene_shard
     assert views["box/occlusion_ratio"].tolist() == [0, 0]
     assert views["camera/intrinsics"][0, 0].tolist() == [50, 0, 24]
     # The hand of the base shard is high above the table: its best grasp by epsilon is the last.
-    kept = read_shard(scene_shard, kind="scene")["grasp/base_index"][views["camera/hand_grasp"]]
-    assert kept.tolist() == [2, 2]
+    assert read_shard(scene_shard, kind="scene")["grasp/base_index"][views["camera/hand_grasp"]].tolist() == [2, 2]
 
 
 def test_a_hand_is_drawn_from_the_grasps_of_the_scenes_if_any(base, scene_shard):
@@ -186,3 +188,92 @@ def test_hands_of_grasps_in_scenes_are_drawn_with_their_wrists(base: Path):
     around, drawn = grasp_sheet.surroundings_of(shard, np.array([2, 0])), render._best_grasps(shard, None)
     assert np.array_equal(around.wrist, wrist[[2, 0]])
     assert np.array_equal(drawn.wrist, wrist)
+
+
+#: Colours of the arrow on the palm and of the prepared mesh: red exceeds blue by at least this [of 255].
+WARM = 60
+
+
+def check(*arguments: str) -> tuple[int, dict[str, Any]]:
+    untried = ["--no-self-test"] if arguments[0] == "hands" else []
+    result = CliRunner().invoke(build_app(), [*arguments, *untried, "--json"])
+    return result.exit_code, json.loads(result.stdout.splitlines()[-1])
+
+
+def test_a_folder_gets_a_verdict_each_and_code_2_if_refused(shared_data: Path, tmp_path: Path) -> None:
+    for source, name in (("quads_and_ngons.obj", "prism"), ("inverted_normals.stl", "mug"), ("garbage.stl", "noise")):
+        folder = tmp_path / "set" / name
+        folder.mkdir(parents=True)
+        (folder / source).write_bytes((shared_data / "bad" / source).read_bytes())
+    code, report = check("objects", "check", str(tmp_path / "set"))
+    assert code == 2 and report["refused"] == ["noise"]
+    said = {one["name"]: one["verdict"] for one in report["objects"]}
+    assert said == {"mug": "repair", "noise": "refuse", "prism": "accept"}
+    assert "--picture draws one object" in refused("objects check --picture p.png", tmp_path / "set")
+    told = CliRunner().invoke(build_app(), ["objects", "check", str(tmp_path / "set")])
+    assert [line.split()[0] for line in told.stdout.splitlines()] == ["repair", "refuse", "accept"]
+    assert "1 of 3 objects were refused: noise" in told.stderr
+    (tmp_path / "set" / "noise" / "garbage.stl").unlink()
+    code, report = check("objects", "check", str(tmp_path / "set"))
+    assert code == 0 and report["refused"] == []
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "verdict"),
+    [
+        ("mimic_chain.urdf", (), "accept"),
+        ("inverted_normals.stl", (), "repair"),
+        ("banana_in_millimetres.stl", (), "refuse"),
+        ("banana_in_millimetres.stl", ("--units", "mm"), "accept"),
+        ("open_shell.stl", ("--allow-open",), "accept"),
+        ("two_components.stl", ("--keep-largest",), "repair"),
+    ],
+)
+def test_files_get_verdict_and_exit_code(shared_data: Path, file: str, options: tuple[str, ...], verdict: str) -> None:
+    kind = "hands" if file.endswith(".urdf") else "objects"
+    code, report = check(kind, "check", str(shared_data / "bad" / file), *options)
+    assert report["verdict"] == verdict, report["message"]
+    assert code == (2 if verdict == "refuse" else 0)
+    assert bool(report["repairs"]) == (verdict == "repair")
+
+
+def test_without_json_refusals_are_one_line_and_guesses_are_told(tmp_path: Path) -> None:
+    for kind in ("hands", "objects"):
+        code, report = check(kind, "check", "nowhere")
+        assert (code, report["verdict"]) == (2, "refuse") and ("allegro" in report["message"]) == (kind == "hands")
+    (tmp_path / "o.stl").write_bytes(b"")
+    (tmp_path / "none").mkdir()
+    result = CliRunner().invoke(build_app(), ["objects", "check", str(tmp_path / "o.stl")])
+    told = CliRunner().invoke(build_app(), ["objects", "check", str(tmp_path / "none")])
+    assert told.exit_code == 2 and "no mesh" in told.stderr
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert len(result.stderr.splitlines()) == 1 and "o.stl" in result.stderr
+    said = CliRunner().invoke(build_app(), ["hands", "check", "barrett", "--no-self-test"]).stdout
+    for word in ("palm", "approach", "fingertips", "dofs", "pre-shape"):
+        assert word in said
+
+
+def test_options_go_over_guesses_drop_fingers_and_weigh() -> None:
+    _, report = check("hands", "check", "allegro", "--fix", "thumb_rotation=1.0,index_distal=0.2")
+    assert len(report["facts"]["dofs"]) == 14
+    _, report = check("hands", "check", "allegro", "--drop", "ring_proximal_link")
+    assert not [name for name in report["facts"]["fingertips"] if name.startswith("ring")]
+    _, report = check("objects", "check", "block", "--density", "500")
+    assert report["facts"]["mass_kg"] == pytest.approx(500 * report["facts"]["volume_m3"])
+
+
+@pytest.mark.parametrize("option", ["--approach 1,2", "--approach a,b,c", "--fix thumb", "--pre-shape thumb=x"])
+def test_an_option_that_cannot_be_read_is_the_callers_mistake(option: str) -> None:
+    result = CliRunner().invoke(build_app(), ["hands", "check", "allegro", *option.split()])
+    assert result.exit_code == 2 and option.split()[0] in result.stderr
+
+
+@pytest.mark.parametrize(("kind", "name"), [("hands", "shadow"), ("objects", "mug")])
+def test_a_built_in_is_accepted_and_its_picture_shows_it(kind: str, name: str, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(portraits, "_SAMPLES", 2)  # grainy, and shown all the same
+    path = tmp_path / "p.png"
+    code, report = check(kind, "check", name, "--picture", str(path))
+    assert (code, report["verdict"], report["repairs"]) == (0, "accept", []) and report["message"] and report["facts"]
+    pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    thirds = np.array_split(pixels, 3, axis=1)
+    assert all((third[..., 0] - third[..., 2] > WARM).sum() > 100 for third in thirds)

@@ -46,8 +46,7 @@ def names_asked_for(text: str) -> set[str]:
 
 
 def example() -> dict[str, str]:
-    lines = re.findall(r"^(?:# )?([A-Z][A-Z0-9_]*)=(.*)$", ENV_EXAMPLE.read_text(), re.MULTILINE)
-    return dict(lines)
+    return dict(re.findall(r"^(?:# )?([A-Z][A-Z0-9_]*)=(.*)$", ENV_EXAMPLE.read_text(), re.MULTILINE))
 
 
 def seconds(duration: str) -> float:

@@ -64,8 +64,7 @@ def test_the_wheel_works_outside_the_repository(first: dict[str, Path], tmp_path
     (packages,) = (tmp_path / "venv").glob("lib/*/site-packages")
     # Only the folder: the editable install of the repository there is in a .pth file, which is not read.
     (packages / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    code = FIRST_STEPS.format(place=str(tmp_path))
-    subprocess.run([python, "-c", code], cwd=tmp_path, check=True)
+    subprocess.run([python, "-c", FIRST_STEPS.format(place=str(tmp_path))], cwd=tmp_path, check=True)
     assert "synth" in completed([tmp_path / "venv" / "bin" / "graspd", "--help"], cwd=tmp_path).stdout
 
 

@@ -140,12 +140,6 @@ def test_nothing_ends_a_worker_that_is_busy() -> None:
     assert not documents("ScaledObject", "HorizontalPodAutoscaler"), "they end pods without asking who is busy"
 
 
-def test_kubernetes_waits_longer_than_a_process_may_take_to_stop() -> None:
-    (settings,) = documents("ConfigMap")
-    for name, pod in pods():
-        assert pod["terminationGracePeriodSeconds"] > float(settings["data"]["GRASPD_STOP_GRACE_S"]), name
-
-
 def test_a_second_controller_takes_over_where_the_first_is_lost() -> None:
     (controller,) = [found for found in documents("Deployment") if found["metadata"]["name"] == "controller"]
     spec = controller["spec"]
@@ -158,7 +152,7 @@ def test_a_second_controller_takes_over_where_the_first_is_lost() -> None:
     assert spec["selector"] in budgets, "a drain of two nodes takes one after the other"
 
 
-def test_the_environment_is_made_of_settings_that_can_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_environment_can_be_read_and_leaves_a_process_time_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     (settings,) = documents("ConfigMap")
     given = set(settings["data"]) | {entry["name"] for _, container in containers() for entry in container["env"]}
     assert {name for name in given if name.startswith("GRASPD_")} <= SETTINGS
@@ -168,6 +162,8 @@ def test_the_environment_is_made_of_settings_that_can_be_read(monkeypatch: pytes
         assert isinstance(value, str), f"{name}: Kubernetes takes strings only"
         monkeypatch.setenv(name, value)
     Settings()
+    for name, pod in pods():
+        assert pod["terminationGracePeriodSeconds"] > float(settings["data"]["GRASPD_STOP_GRACE_S"]), name
 
 
 def test_no_secret_is_written_down() -> None:
@@ -179,8 +175,7 @@ def test_no_secret_is_written_down() -> None:
 
 
 def test_every_reference_to_a_secret_is_one_that_the_docs_make() -> None:
-    text = yaml.safe_dump_all(documents())
-    named = set(re.findall(r"(graspd-(?:redis|index|store|keys))\b", text))
+    named = set(re.findall(r"(graspd-(?:redis|index|store|keys))\b", yaml.safe_dump_all(documents())))
     page = (REPOSITORY / "docs" / "how-to" / "install.md").read_text()
     assert named == {name for name in named if f"secret generic {name}" in page}
 

@@ -216,11 +216,14 @@ def proxy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxy]:
             process.wait(timeout=60)
 
 
-def test_a_key_opens_the_api_through_tls(proxy: Proxy) -> None:
+def test_a_key_opens_the_api_through_tls_where_plain_http_is_sent(proxy: Proxy) -> None:
     assert proxy.client.get("/v1/jobs").status_code == 401
     answer = proxy.client.get("/v1/jobs", headers={"Authorization": f"Bearer {proxy.key}"})
     assert answer.status_code == 200, answer.text
     assert "max-age" in answer.headers["strict-transport-security"]
+    plain = f"http://127.0.0.1:{proxy.plain_port}/jobs"
+    answer = httpx.get(plain, headers={"Host": NAME}, trust_env=False, timeout=60)
+    assert answer.status_code == 301 and answer.headers["location"] == f"https://{NAME}/jobs"
 
 
 def test_a_browser_signs_in_through_the_proxy(proxy: Proxy) -> None:
@@ -231,9 +234,3 @@ def test_a_browser_signs_in_through_the_proxy(proxy: Proxy) -> None:
     assert re.search("HttpOnly", answer.headers["set-cookie"], re.IGNORECASE)
     answer = proxy.client.post("/login", data={"key": proxy.key}, headers={"Origin": "https://elsewhere.example"})
     assert answer.status_code == 403
-
-
-def test_plain_http_is_sent_to_tls(proxy: Proxy) -> None:
-    plain = f"http://127.0.0.1:{proxy.plain_port}/jobs"
-    answer = httpx.get(plain, headers={"Host": NAME}, trust_env=False, timeout=60)
-    assert answer.status_code == 301 and answer.headers["location"] == f"https://{NAME}/jobs"

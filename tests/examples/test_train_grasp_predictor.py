@@ -62,7 +62,7 @@ def test_a_row_is_its_grasp_where_the_object_lies() -> None:
         np.testing.assert_allclose(getattr(found, part), getattr(grasps, part).joint_positions, atol=1e-12)
 
 
-def test_points_seen_lie_on_the_object_as_it_stands_on_the_table(tmp_path: Path) -> None:
+def test_points_seen_lie_on_the_object_and_valid_grasps_are_taught(tmp_path: Path) -> None:
     box_scenes.write(tmp_path)
     seen = sights(open_shards(tmp_path), noise="structured_light")
     assert len(seen) == box_scenes.VIEWS
@@ -71,10 +71,6 @@ def test_points_seen_lie_on_the_object_as_it_stands_on_the_table(tmp_path: Path)
         # 3 standard deviations of the noise at half a metre, and the bleeding of edges.
         assert np.quantile((inside - box_scenes.SIZE / 2).max(axis=1), 0.9) < 0.006
         np.testing.assert_allclose(sight.object_pose, box_scenes.POSES[sight.scene.number])
-
-
-def test_only_valid_grasps_are_taught_each_in_its_scene(tmp_path: Path) -> None:
-    box_scenes.write(tmp_path)
     found = taught(open_shards(tmp_path), "box")
     assert [scene.number for scene in found.scenes] == box_scenes.SCENE_OF_GRASP[box_scenes.VALID == 1].tolist()
     assert {scene.number: len(rows) for scene, rows in each_scene(found)} == {0: 3, 1: 2}

@@ -183,7 +183,7 @@ def test_the_object_of_the_cloud_is_where_grasps_mean_it(root, split, hand, bloc
         assert np.abs(rest[:, 2]).max(initial=0) < POINT_M
 
 
-def test_a_grasp_points_where_its_script_says(root, split, hand, stored: Shard, block) -> None:
+def test_grasps_point_and_graspness_is_as_its_script_says(root, split, hand, stored: Shard, block) -> None:
     surface = surface_samples(block)
     pads = [fingertip_pad(hand, tip).centre for tip in hand.fingertips]
     (found,) = drawn(root, split, hand, 1, seed=6)
@@ -195,19 +195,15 @@ def test_a_grasp_points_where_its_script_says(root, split, hand, stored: Shard, 
         best = pointed(apply(pose, hand.palm.centre), ((first + second) / 2 + thumb) / 2, surface)
         np.testing.assert_allclose(found.point[number], found.placed(surface)[best], atol=ROUNDING_M)
     assert len(found.row)
-
-
-def test_graspness_is_that_of_its_script(root: Path, split: range, hand, block) -> None:
-    surface = surface_samples(block)
-    for found in drawn(root, split, hand, 3, seed=7):
-        assert found.has_graspness
-        there = found.placed(surface)
-        mine = np.flatnonzero(found.seg == 1)
+    for other in drawn(root, split, hand, 3, seed=7):
+        assert other.has_graspness
+        there = other.placed(surface)
+        mine = np.flatnonzero(other.seg == 1)
         for number in mine[:: max(1, len(mine) // 40)]:
-            value = graspness_at(found.point_clouds[number], there, found.point)
-            np.testing.assert_allclose(found.graspness[number], np.log(value + 1e-3), rtol=1e-5)
-        np.testing.assert_allclose(found.graspness[found.seg != 1], np.log(1e-3), rtol=1e-6)
-        assert found.graspness.max() > np.log(0.5)
+            value = graspness_at(other.point_clouds[number], there, other.point)
+            np.testing.assert_allclose(other.graspness[number], np.log(value + 1e-3), rtol=1e-5)
+        np.testing.assert_allclose(other.graspness[other.seg != 1], np.log(1e-3), rtol=1e-6)
+        assert other.graspness.max() > np.log(0.5)
 
 
 def test_graspness_belongs_to_cloud_that_a_depth_camera_tells(on_tables: Path, hand, tmp_path: Path) -> None:
@@ -288,8 +284,7 @@ def test_archives_are_neither_unpickled_nor_believed(tmp_path: Path, monkeypatch
 
 
 def test_what_shows_no_scene_or_no_clear_grasp_is_told(on_tables: Path, tmp_path: Path, monkeypatch) -> None:
-    said = refused("export --format dexgraspnet2 -o", tmp_path / "out", on_tables / "block.h5")
-    assert "no picture shows" in said
+    assert "no picture shows" in refused("export --format dexgraspnet2 -o", tmp_path / "out", on_tables / "block.h5")
     none = PictureReference(0, "base", "views", 0, np.eye(4), IDENTITY_POSE, np.zeros(0, np.intp))
     monkeypatch.setattr(dexgraspnet2, "by_scene", lambda pictures: [[none]])
     lots = [SimpleNamespace(id="base")]

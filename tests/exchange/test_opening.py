@@ -21,13 +21,10 @@ def test_a_file_that_its_library_cannot_read_is_named(suffix: str, content: byte
         (tmp_path / f"broken{suffix}").write_bytes(content)
 
 
-def test_files_that_were_there_before_are_not_looked_at(tmp_path) -> None:
+def test_only_files_that_are_written_anew_are_looked_at(tmp_path) -> None:
     (tmp_path / "old.xml").write_bytes(b"broken")
     with check_written_files(tmp_path):
         (tmp_path / "new.json").write_text("{}")
-
-
-def test_a_file_that_is_written_anew_is_looked_at(tmp_path) -> None:
     (tmp_path / "scene.xml").write_text("<mujoco/>")
     with pytest.raises(GraspdError, match="scene"), check_written_files(tmp_path):
         (tmp_path / "scene.xml").write_text("<mujoco><tendon><fixed/></tendon></mujoco>")

@@ -27,8 +27,11 @@ def runner(folder: Path, **options: bool) -> Runner:
     return Runner(folder / "docs", folder / "work", **options)
 
 
-def test_the_manifest_holds_every_figure_and_picture_as_it_is() -> None:
+def test_the_manifest_holds_every_figure_and_picture_of_one_study_each() -> None:
     assert faults(DOCS, load(DOCS)) == []
+    held = [path for study in STUDIES for path in digests(study, DOCS)]
+    assert len(held) == len(set(held)) and set(held) == there(DOCS)
+    assert (DOCS / INDEX).read_text() == page.index(load(DOCS)), "run: make docs"
 
 
 def test_git_keeps_what_readers_see_and_no_raw_results() -> None:
@@ -44,17 +47,10 @@ def test_git_keeps_what_readers_see_and_no_raw_results() -> None:
     assert sum(file.read_text().count("\n") for file in texts) <= MOST_LINES
 
 
-def test_each_file_belongs_to_one_study() -> None:
-    held = [path for study in STUDIES for path in digests(study, DOCS)]
-    assert len(held) == len(set(held)) and set(held) == there(DOCS)
-    assert (DOCS / INDEX).read_text() == page.index(load(DOCS)), "run: make docs"
-
-
 @pytest.mark.parametrize("path", page.PAGES, ids=lambda path: path.name)
 def test_what_a_page_cites_is_held_and_its_tables_are_current(path: Path) -> None:
     held = {name for record in load(DOCS).values() for name in record["files"]} | {INDEX, manifest.MANIFEST}
-    folders = {str(parent) for name in held for parent in Path(name).parents}
-    assert set(page.cited(path)) <= held | folders
+    assert set(page.cited(path)) <= held | {str(parent) for name in held for parent in Path(name).parents}
     text = path.read_text()
     assert page.renewed(text, DOCS) == text, "run: make docs"
 

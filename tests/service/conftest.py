@@ -79,8 +79,7 @@ def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
 
 def service(folder: Path, store: Store | None = None, queue: RqQueue | None = None, **said: Any) -> Iterator[Services]:
     """A service without processes, with a hand `gripper` and an object `ball`; each batch is a task."""
-    wanted = Settings(data_dir=folder, **{"retry_backoff_s": 0.0, "task_s": 0.0, **said})
-    made = open_services(wanted, store, queue)
+    made = open_services(Settings(data_dir=folder, **{"retry_backoff_s": 0.0, "task_s": 0.0, **said}), store, queue)
     add_assets(made)
     yield made
     made.close()

@@ -216,7 +216,7 @@ def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, monkeypat
     assert raw.columns["quality/valid"].any(), "a grasp that is not robust is valid all the same"
 
 
-def test_a_part_of_a_part_fills_its_share_of_the_whole() -> None:
+def test_a_part_fills_its_share_and_a_quiet_one_can_be_stopped() -> None:
     told: list[tuple[float, float, str]] = []
     run = ExecutionContext("cuda:7", 3, lambda *what: told.append(what), lambda: True)
     part = run.part(0.5, 1.0).part(0.0, 0.5)
@@ -225,10 +225,7 @@ def test_a_part_of_a_part_fills_its_share_of_the_whole() -> None:
     part.progress(0, 0, "of nothing")
     assert told == [(0.625, 1.0, "half"), (0.75, 1.0, "whole"), (0.5, 1.0, "of nothing")]
     assert (part.device, part.threads, part.cancelled()) == ("cuda:7", 3, True)
-
-
-def test_a_quiet_part_tells_nothing_and_can_still_be_stopped() -> None:
-    told: list[tuple[float, float, str]] = []
+    told.clear()
     run = ExecutionContext(progress=lambda *what: told.append(what), cancelled=lambda: True).without_progress()
     run.progress(1, 1, "done")
     assert not told

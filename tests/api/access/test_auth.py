@@ -67,8 +67,7 @@ def test_a_reader_only_reads_and_a_wider_scope_includes_it(closed: Closed, keys:
 
 def test_a_key_opens_a_session_and_its_end_ends_it(closed: Closed, keys: KeyFile) -> None:
     client, tokens = closed
-    answer = client.post("/login", data={"key": tokens[Scope.SUBMIT]}, follow_redirects=False)
-    cookie = answer.headers["set-cookie"]
+    cookie = client.post("/login", data={"key": tokens[Scope.SUBMIT]}, follow_redirects=False).headers["set-cookie"]
     assert all(word in cookie for word in ("HttpOnly", "SameSite=strict", "Secure"))
     assert tokens[Scope.SUBMIT] not in cookie
     assert client.get("/").status_code == 200
@@ -193,37 +192,30 @@ def test_an_open_service_has_the_names_of_this_machine_alone(http: TestClient) -
         assert http.get("/healthz", headers={"Host": host}).status_code == status
 
 
-def test_without_keys_only_this_machine_is_served(tmp_path: Path) -> None:
+def test_without_keys_only_this_machine_is_served_and_their_file_is_private(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path, host="0.0.0.0")
     assert keys_finding(settings).fix == "graspd keys add admin --scope admin"
     assert keys_finding(Settings(data_dir=tmp_path)).condition is Condition.GOOD
     KeyFile(settings.resolved_keys_file).add("admin", Scope.ADMIN)
     assert keys_finding(settings).condition is Condition.GOOD
-
-
-def test_keys_that_end_soon_are_named_unless_they_were_rotated(tmp_path: Path) -> None:
-    settings = Settings(data_dir=tmp_path)
-    file = KeyFile(settings.resolved_keys_file)
-    file.add("admin", Scope.ADMIN)
-    file.add("robot", Scope.SUBMIT, lifetime=timedelta(days=2))
-    found = keys_finding(settings)
-    assert (found.condition, found.fix) == (Condition.WARNING, "graspd keys rotate robot --grace 24h")
-    file.rotate("robot", grace=timedelta(hours=24))
-    assert keys_finding(settings).condition is Condition.GOOD
-    file.revoke("admin")
-    assert keys_finding(settings).condition is Condition.WARNING, "nobody is admin"
-    file.revoke("robot")
-    assert not keys_finding(settings).ok, "no key opens it"
-
-
-def test_a_file_that_everybody_reads_or_nobody_can_is_bad(tmp_path: Path) -> None:
-    settings = Settings(data_dir=tmp_path)
-    KeyFile(settings.resolved_keys_file).add("admin", Scope.ADMIN)
     settings.resolved_keys_file.chmod(0o644)
     assert "chmod 600" in keys_finding(settings).fix
     settings.resolved_keys_file.write_text("{")
     found = keys_finding(settings)
     assert not found.ok and str(settings.resolved_keys_file) in found.message
+
+
+def test_keys_that_end_soon_are_named_unless_they_were_rotated(settings: Settings, keys: KeyFile) -> None:
+    keys.add("admin", Scope.ADMIN)
+    keys.add("robot", Scope.SUBMIT, lifetime=timedelta(days=2))
+    found = keys_finding(settings)
+    assert (found.condition, found.fix) == (Condition.WARNING, "graspd keys rotate robot --grace 24h")
+    keys.rotate("robot", grace=timedelta(hours=24))
+    assert keys_finding(settings).condition is Condition.GOOD
+    keys.revoke("admin")
+    assert keys_finding(settings).condition is Condition.WARNING, "nobody is admin"
+    keys.revoke("robot")
+    assert not keys_finding(settings).ok, "no key opens it"
 
 
 def basic(user: str, secret: str = SECRET) -> str:
@@ -300,8 +292,7 @@ def test_a_session_signed_with_the_empty_secret_opens_nothing(behind: Settings, 
             assert answers[0].status_code == answers[1].status_code < 500
 
 
-def test_a_key_file_without_a_secret_opens_no_session(settings: Settings) -> None:
-    keys = KeyFile(settings.resolved_keys_file)
+def test_a_key_file_without_a_secret_opens_no_session(settings: Settings, keys: KeyFile) -> None:
     keys.add("robot", Scope.ADMIN)
     file = json.loads(settings.resolved_keys_file.read_text())
     settings.resolved_keys_file.write_text(json.dumps(file | {"session_secret": ""}))

@@ -1,4 +1,4 @@
-"""Who may cancel, retry and delete what: the key that submitted it, or an admin's."""
+"""Rights of keys: who may cancel, retry and delete what, and what the keys of a project may use together."""
 
 from collections.abc import Callable, Iterator
 from contextlib import closing, nullcontext
@@ -6,19 +6,22 @@ from typing import Any
 
 import pytest
 from httpx import Response
+from sqlalchemy import update
 from starlette.testclient import TestClient
 
 from graspd.api.access.auth import ForeignResource, caller, require_ownership
-from graspd.api.access.keys import Key, KeyFile, Scope
+from graspd.api.access.keys import Key, KeyFile, ProjectLimits, Scope
 from graspd.api.app import create_app
 from graspd.service.index.index import Index
 from graspd.service.index.rebuild import rebuild
+from graspd.service.index.tables import shards
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.network_file import to_bytes
-from tests.api.factories import bearer, people_of
-from tests.fakes import plan_all
+from tests.api.conftest import TODAY
+from tests.api.factories import bearer, finish_all, people_of
+from tests.fakes import plan_all, record_of
 from tests.networks import random_network
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
@@ -101,8 +104,7 @@ def test_a_rotated_key_keeps_its_jobs_and_a_later_one_has_none(ask: Ask, keys: K
     job, other = submitted(ask, "ann"), bearer(keys.rotate("ann"))
     assert ask(other, "POST", f"/v1/jobs/{job}/cancel").status_code == 202
     keys.revoke("ann")
-    later = bearer(keys.add("ann", Scope.SUBMIT))
-    assert ask(later, "POST", f"/v1/jobs/{job}/retry").status_code == 403
+    assert ask(bearer(keys.add("ann", Scope.SUBMIT)), "POST", f"/v1/jobs/{job}/retry").status_code == 403
 
 
 def test_keys_of_before_there_were_ids_have_one_through_rotation(keys: KeyFile) -> None:
@@ -116,8 +118,7 @@ def test_owners_are_in_the_store_and_survive_a_lost_index(ask: Ask, services: Se
     job = submitted(ask, "ann")
     ask("ann", "POST", "/v1/datasets", json=MATRIX)
     file = ("ball.stl", b"solid ball\nendsolid ball\n")
-    added = ask("ann", "POST", "/v1/objects", files={"file": file})
-    assert added.status_code == 202
+    assert ask("ann", "POST", "/v1/objects", files={"file": file}).status_code == 202
     with closing(Index("sqlite://")) as fresh:
         rebuild(fresh, services.store)
         found = fresh.jobs.get(job), fresh.datasets.get("d"), fresh.assets.get(AssetKind.OBJECT, "ball")
@@ -168,6 +169,103 @@ def test_objects_networks_and_sets_are_changed_by_their_key(ask: Ask, who: str, 
     assert built_in == (403 if who == "eve" else 409), "it comes with graspd"
     assert put("ann", "mug") == put("root", "mug") == 201
     assert put(who, "mug", "block") == (201 if may else 403)
-    held = ask("eve", "GET", "/v1/object-sets/s").json()["objects"]
-    assert ("block" in held) is may
+    assert ("block" in ask("eve", "GET", "/v1/object-sets/s").json()["objects"]) is may
     assert put("ann", "block") == 201
+
+
+Submit = Callable[..., Any]
+
+
+@pytest.fixture
+def service(make_twins: Callable[[], list[TestClient]]) -> TestClient:
+    return make_twins()[0]
+
+
+@pytest.fixture
+def submitting(service: TestClient, settings: Settings) -> Submit:
+    """Submits a job in the name of a key: two are of `red`, one of `blue`."""
+    projects = {"ann": "red", "amy": "red", "bob": "blue"}
+    people = people_of(settings, **{name: (Scope.SUBMIT, project) for name, project in projects.items()})
+
+    def submit(who: str, seed: int, path: str = "/v1/jobs", /, **changes: Any) -> Any:
+        body = {**JOB, "seed": seed, **changes} if path == "/v1/jobs" else changes
+        return service.post(path, json=body, headers=people[who])
+
+    return submit
+
+
+def limit(settings: Settings, **limits: int) -> None:
+    KeyFile(settings.resolved_keys_file).limit_project("red", ProjectLimits(**limits))
+
+
+def done(services: Services, job: str, *, seconds: float, device: str = "cuda:0", day: str = TODAY) -> None:
+    (made,) = finish_all(services, record_of(services, job))
+    values = {"device": device, "created": f"{day}T11:00:00.000000Z", "seconds": seconds}
+    with services.index.database.write_transaction() as connection:
+        connection.execute(update(shards).where(shards.c.id == made.shard_id).values(**values))
+
+
+def refused(answer: Any) -> str:
+    assert answer.status_code == 429 and answer.json()["type"] == "/problems/quota-exceeded", answer.text
+    return str(answer.json()["detail"])
+
+
+def test_keys_of_a_project_share_its_grasps_in_work(submitting: Submit, settings: Settings, services: Services) -> None:
+    limit(settings, grasps_in_flight=64)
+    first = submitting("ann", 1).json()["id"]
+    assert submitting("amy", 2).status_code == 202
+    assert "the project 'red' has 64 grasps in unfinished jobs, and at most 64 are allowed" in refused(
+        submitting("amy", 3)
+    )
+    assert submitting("bob", 3).status_code == 202
+    finish_all(services, record_of(services, first))
+    assert submitting("amy", 3).status_code == 202, "one of ann's ended"
+
+
+def test_keys_of_a_project_share_its_grasps_of_a_day(
+    submitting: Submit, settings: Settings, services: Services
+) -> None:
+    limit(settings, grasps_per_day=96)
+    finish_all(services, record_of(services, submitting("ann", 1).json()["id"]))
+    too_many = submitting("amy", 2, grasps=65)
+    assert "has requested 32 of 96 grasps allowed per day" in refused(too_many), "also for what is done"
+    assert 12 * 3600 <= int(too_many.headers["retry-after"]) <= 12 * 3600 + 1, "until midnight, and not before"
+    matrix = {"name": "d", "hands": ["allegro"], "objects": ["mug", "bottle"], "grasps": 32}
+    assert submitting("amy", 0, "/v1/datasets", **matrix | {"grasps": 33}).status_code == 429
+    assert submitting("amy", 0, "/v1/datasets", **matrix).status_code == 202
+    assert "has requested 96 of 96" in refused(submitting("ann", 2))
+    assert submitting("bob", 2).status_code == 202
+
+
+def test_a_project_without_gpu_seconds_left_submits_no_more(
+    submitting: Submit, settings: Settings, services: Services
+) -> None:
+    limit(settings, gpu_seconds_per_day=60)
+    made = [submitting("ann", seed).json()["id"] for seed in (1, 2)]
+    waiting = submitting("ann", 3).json()["id"]
+
+    done(services, made[0], device="cpu", seconds=61.0)
+    done(services, submitting("ann", 4).json()["id"], day="2026-11-19", seconds=61.0)
+    assert submitting("amy", 5).status_code == 202, "neither a CPU's time nor yesterday's counts"
+    done(services, made[1], seconds=61.0)
+    assert "the project 'red' has used 61 of the 60 GPU seconds allowed per day" in refused(submitting("amy", 6))
+    assert submitting("bob", 6).status_code == 202
+    assert not services.index.jobs.get(waiting).state.is_final, "what was submitted before goes on"
+
+
+def test_usage_is_of_the_own_project(
+    submitting: Submit, service: TestClient, settings: Settings, services: Services
+) -> None:
+    for name, seed in (("ann", 1), ("bob", 2)):
+        done(services, submitting(name, seed).json()["id"], seconds=2.5)
+    keys = KeyFile(settings.resolved_keys_file)
+    reader, admin = keys.add("reader", Scope.READ, project="red"), keys.add("root", Scope.ADMIN)
+
+    def read(path: str, token: str) -> Any:
+        return service.get(path, params={"since": TODAY, "until": TODAY}, headers=bearer(token))
+
+    (own,) = read("/v1/usage", reader).json()
+    assert (own["project"], own["day"], own["grasps"], own["gpu_seconds"]) == ("red", TODAY, 32, 2.5)
+    lines = read("/v1/usage.csv", reader).text.splitlines()
+    assert lines == [",".join(own), ",".join(str(value) for value in own.values())]
+    assert {day["project"] for day in read("/v1/usage", admin).json()} == {"red", "blue"}

@@ -189,8 +189,7 @@ def test_of_two_versions_of_a_set_at_once_one_follows_the_other(twins: list[Test
     for number in range(ROUNDS):
         name = f"set{number}"
         bodies = [{"name": name, "objects": objects} for objects in (["mug"], ["block"])]
-        answers = at_once(twins, lambda http, n, bodies=bodies: http.post(SETS, json=bodies[n]))
-        assert codes(answers) == [201, 201]
+        assert codes(at_once(twins, lambda http, n, bodies=bodies: http.post(SETS, json=bodies[n]))) == [201, 201]
         kept = [read_record(ObjectSet, services.store, one.key) for one in services.store.list(f"object_sets/{name}")]
         first = next(one for one in kept if one.digest == object_set_of(name, one.objects).digest)
         later = next(one for one in kept if one is not first)
@@ -245,8 +244,7 @@ def test_a_tag_given_twice_at_once_has_the_grasps_of_both(twins: list[TestClient
     shard = finish_all(services, record_of(services, job))[0].shard_id
 
     def give(http: TestClient, number: int) -> Response:
-        chosen = {"name": "good", "grasps": [{"shard_id": shard, "row": number}]}
-        return http.post("/v1/tags", json=chosen)
+        return http.post("/v1/tags", json={"name": "good", "grasps": [{"shard_id": shard, "row": number}]})
 
     assert codes(at_once(twins, give)) == [200, 200]
     assert [tag["grasps"] for tag in twins[0].get("/v1/tags").json()] == [2]

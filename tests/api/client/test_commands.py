@@ -248,8 +248,7 @@ def test_an_api_that_cannot_start_says_why_in_one_line(graspd: Shell, tmp_path: 
 
 def test_keys_are_made_listed_and_revoked(graspd: Shell, tmp_path: Path) -> None:
     shell = Shell(graspd.environment | {"GRASPD_DATA_DIR": str(tmp_path)})
-    made = shell.json("keys", "add", "lab", "--scope", "read")
-    assert made["key"].startswith("gd_")
+    assert shell.json("keys", "add", "lab", "--scope", "read")["key"].startswith("gd_")
     assert [(key["name"], key["revoked"]) for key in shell.json("keys", "list")["keys"]] == [("lab", None)]
     shell.json("keys", "revoke", "lab")
     assert shell.json("keys", "list")["keys"][0]["revoked"] is not None
@@ -285,11 +284,13 @@ def test_a_dataset_is_created_listed_cancelled_and_retried(graspd: Shell, servic
     until(service, "kitchen", State.QUEUED)
 
 
-def test_the_matrix_is_a_table_of_objects_and_hands(graspd: Shell) -> None:
+def test_a_dataset_is_a_table_and_without_shards_no_snapshot(graspd: Shell, tmp_path: Path) -> None:
     graspd.json("datasets", "create", "table", *CREATE[3:], "--seed", "7", "--yes")
     lines = [line.split() for line in graspd("datasets", "status", "table").stdout.splitlines()]
     head = lines.index(["allegro", "barrett"])
     assert lines[head + 1 : head + 3] == [["mug", "queued", "queued"], ["block", "queued", "queued"]]
+    for command in (("snapshot", "table"), ("export", "table", "-o", str(tmp_path))):
+        assert "no shard yet" in said(graspd("datasets", *command))
 
 
 def test_nobody_at_the_terminal_means_nothing_starts(graspd: Shell) -> None:
@@ -314,12 +315,6 @@ def test_a_folder_of_unusable_objects_makes_no_dataset(graspd: Shell, tmp_path: 
     (tmp_path / "asset.json").write_text("{}")
     done = graspd("datasets", "create", "none", "--hands", "allegro", "--objects", str(tmp_path), "--yes")
     assert "none of the 1 objects can be used" in said(done)
-
-
-def test_a_snapshot_of_nothing_is_refused(graspd: Shell, tmp_path: Path) -> None:
-    graspd.json("datasets", "create", "empty", *CREATE[3:], "--seed", "9", "--yes")
-    for command in (("snapshot", "empty"), ("export", "empty", "-o", str(tmp_path))):
-        assert "no shard yet" in said(graspd("datasets", *command))
 
 
 def test_a_spec_in_a_file_is_what_the_options_would_say(graspd: Shell, tmp_path: Path) -> None:

@@ -32,14 +32,11 @@ def asked(file: Path | None, *, hands: str | None = None, objects: str | None = 
     return plan_request(file, name=None, hands=hands, objects=objects, options=options)
 
 
-def test_a_spec_says_it_all(tmp_path: Path) -> None:
+def test_a_spec_says_it_all_in_toml_and_in_json(tmp_path: Path) -> None:
     found = asked(spec(tmp_path, TOML))
     assert (found.name, found.hands, found.objects) == ("kitchen", "allegro,barrett", "mug,block")
     assert found.options == {"scenes": 2, "stereo": True, "fidelity": "draft"}
     assert found.matrix_per_cell({"hands": ["a", "b"]}, 3)["grasps"] == 167  # a sixth of 1000, rounded up
-
-
-def test_json_says_the_same(tmp_path: Path) -> None:
     text = json.dumps({"hands": ["allegro"], "objects": ["mug"], "grasps": 7, "options": {"steps": 20}})
     found = asked(spec(tmp_path, text, "kitchen.json"))
     assert found.options == {"grasps": 7, "options": {"steps": 20}} and found.total is None
@@ -54,8 +51,7 @@ def test_an_option_goes_before_the_spec(tmp_path: Path) -> None:
 
 def test_a_folder_of_objects_lies_beside_the_spec(tmp_path: Path) -> None:
     (tmp_path / "meshes").mkdir()
-    found = asked(spec(tmp_path, 'hands = ["allegro"]\nobjects = "./meshes"'))
-    assert Path(found.objects) == tmp_path / "meshes"
+    assert Path(asked(spec(tmp_path, 'hands = ["allegro"]\nobjects = "./meshes"')).objects) == tmp_path / "meshes"
 
 
 @pytest.mark.parametrize(

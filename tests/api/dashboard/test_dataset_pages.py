@@ -83,15 +83,13 @@ def test_a_dataset_is_made_watched_retried_and_frozen(http: TestClient, services
     assert http.post("/datasets/kitchen/retry").status_code == 200
     assert "a dataset has no action 'burn'" in http.post("/datasets/kitchen/burn").json()["detail"]
     finish_all(services, add_job(services, fidelity="draft"))
-    answer = http.post("/datasets/kitchen/snapshot")
-    assert "The snapshot is taken" in answer.text
+    assert "The snapshot is taken" in http.post("/datasets/kitchen/snapshot").text
     assert len(services.index.datasets.snapshots("kitchen").items) == 1
 
 
 def test_a_dataset_is_made_in_scenes_with_neighbours(http: TestClient, services: Services) -> None:
     form = {"name": "clutter", "grasps": "32", "hands": ["allegro"], "objects": ["mug"], "neighbours": "block, bottle"}
-    page = http.post("/datasets", data=form | {"scene": "table"}).text
-    assert "on a table with neighbours block, bottle" in page
+    assert "on a table with neighbours block, bottle" in http.post("/datasets", data=form | {"scene": "table"}).text
     assert [one.object for one in services.index.datasets.get("clutter").options.beside] == ["block", "bottle"]
     wrong = http.post("/datasets", data=form | {"name": "afloat"})
     assert wrong.status_code == 422 and "neighbours need a scene" in wrong.text
@@ -186,7 +184,7 @@ def _two(services: Services) -> None:
     finish_all(services, add_job(services, fidelity="draft"))
 
 
-def test_the_page_shows_what_differs_and_every_cell(http: TestClient, services: Services) -> None:
+def test_the_page_of_two_datasets_shows_what_differs_and_every_cell(http: TestClient, services: Services) -> None:
     _two(services)
     page = " ".join(http.get("/compare", params={"one": "rough", "other": "fine"}).text.split())
     assert "Fidelity</th><td" in page and ">draft</td>" in page and ">standard</td>" in page
@@ -194,10 +192,6 @@ def test_the_page_shows_what_differs_and_every_cell(http: TestClient, services: 
     assert page.count("<td>allegro</td>") == 2
     assert page.count('<figure class="card histo twin">') > 3
     assert "options are the same" not in page
-
-
-def test_a_dataset_beside_itself_differs_in_nothing(http: TestClient, services: Services) -> None:
-    _two(services)
     page = http.get("/compare", params={"one": "rough", "other": "rough"}).text
     assert "options are the same" in page and "+0 points" in page
     assert "No grasp yet" in http.get("/compare", params={"one": "fine", "other": "fine"}).text
@@ -207,17 +201,15 @@ def test_a_dataset_beside_itself_differs_in_nothing(http: TestClient, services: 
     assert "/compare?one=rough&amp;other=fine" in http.get("/datasets").text
 
 
-def test_distributions_of_two_share_their_bins_and_count_all(services: Services) -> None:
+def test_distributions_of_two_share_bins_and_too_many_cells_are_left_out(
+    services: Services, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _two(services)
     filters = [GraspFilter(dataset="rough", valid=valid) for valid in (True, False, None)]
     one, other, both = services.index.statistics.compare_distributions(filters, ["epsilon"], bins=7)["epsilon"]
     assert one is not None and other is not None and both is not None
     assert (one.low, one.high) == (other.low, other.high)
     assert [a + b for a, b in zip(one.counts, other.counts, strict=True)] == both.counts
-
-
-def test_more_cells_than_anybody_reads_are_left_out(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
-    _two(services)
     monkeypatch.setattr("graspd.api.catalog.datasets.MOST_CELLS", 1)
     datasets = Datasets(services, None)  # type: ignore[arg-type]
     assert datasets.compare("rough", "fine").pairs == [] and Pair("hand", "object", None, None).gain is None

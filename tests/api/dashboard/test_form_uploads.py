@@ -62,7 +62,7 @@ def stored_options(services: Services, asset: AssetView) -> dict[str, Any]:
     return dict(json.loads(load_asset_files(services.store, AssetKind.OBJECT, asset.digest)["asset.json"]))
 
 
-def test_a_refused_file_is_what_the_form_goes_on_to_show(http: TestClient, services: Services) -> None:
+def test_a_refused_file_stays_on_the_form_and_is_chosen_nowhere_else(http: TestClient, services: Services) -> None:
     uploaded(http, services, "refuse")
     answer = http.post("/submit", data=FORM, files={"file": MESH})
     for page in (answer, http.post("/submit", data=fields_of(answer.text))):  # pressed again, it runs no other object
@@ -72,6 +72,12 @@ def test_a_refused_file_is_what_the_form_goes_on_to_show(http: TestClient, servi
     assert "your file part (refused)" in answer.text and 'data-model="/v1/objects/mug/model"' not in answer.text
     known = http.post("/submit", data=fields_of(answer.text) | {"object": "block"}, follow_redirects=False)
     assert known.status_code == 303 and jobs(services) == ["block"]
+    for page in ("/submit", "/datasets", "/grasps"):
+        assert not re.search(r">\s*part\b", http.get(page).text), page
+    assert "part" not in {one["name"] for one in http.get("/v1/objects").json()["items"]}
+    everything = http.get("/v1/objects", params={"refused": True}).json()["items"]
+    assert ("part", "refuse") in {(one["name"], one["verdict"]) for one in everything}
+    assert "part" not in http.get("/v1/objects/nothing").json()["detail"]
 
 
 def test_a_refused_file_is_checked_in_other_units_unsent(http: TestClient, services: Services) -> None:
@@ -175,21 +181,10 @@ def test_facts_that_an_upload_says_of_itself_break_no_page(http: TestClient, ser
     assert list(fixes_of(page)) == ["Use &lt;b&gt; as root link"]
 
 
-def test_what_was_refused_can_be_chosen_nowhere(http: TestClient, services: Services) -> None:
-    uploaded(http, services, "refuse")
-    for page in ("/submit", "/datasets", "/grasps"):
-        assert not re.search(r">\s*part\b", http.get(page).text), page
-    assert "part" not in {one["name"] for one in http.get("/v1/objects").json()["items"]}
-    everything = http.get("/v1/objects", params={"refused": True}).json()["items"]
-    assert ("part", "refuse") in {(one["name"], one["verdict"]) for one in everything}
-    assert "part" not in http.get("/v1/objects/nothing").json()["detail"]
-
-
 def test_a_file_of_other_content_is_another_object(http: TestClient, services: Services) -> None:
     first = uploaded(http, services, "accept")
     other = {"file": ("part.stl", b"solid another\nendsolid\n")}
-    second = http.post("/v1/objects", files=other, data={"rename": "true"}).json()
-    assert second["name"] == "part-2"
+    assert http.post("/v1/objects", files=other, data={"rename": "true"}).json()["name"] == "part-2"
     again = http.post("/v1/objects", files={"file": MESH}, data={"rename": "true"}).json()
     assert (again["name"], again["digest"]) == ("part", first.digest)
 

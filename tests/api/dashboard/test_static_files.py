@@ -29,11 +29,6 @@ def parsed(name: str) -> nodes.Template:
     return ENVIRONMENT.parse(ENVIRONMENT.loader.get_source(ENVIRONMENT, name)[0])
 
 
-def unknown_calls(template: nodes.Template) -> set[str]:
-    called = {call.node.name for call in template.find_all(nodes.Call) if isinstance(call.node, nodes.Name)}
-    return called - macros(template) - GIVEN - set(ENVIRONMENT.globals)
-
-
 def macros(template: nodes.Template) -> set[str]:
     return imports(template) | {macro.name for macro in template.find_all(nodes.Macro)}
 
@@ -46,7 +41,8 @@ def imports(template: nodes.Template) -> set[str]:
 def test_a_template_compiles_and_calls_what_there_is(name: str) -> None:
     ENVIRONMENT.get_template(name)
     assert imports(parsed(name)) <= macros(parsed("parts.html"))
-    missing = unknown_calls(parsed(name))
+    called = {call.node.name for call in parsed(name).find_all(nodes.Call) if isinstance(call.node, nodes.Name)}
+    missing = called - macros(parsed(name)) - GIVEN - set(ENVIRONMENT.globals)
     including = [one for one in TEMPLATES if name in (meta.find_referenced_templates(parsed(one)) or ())]
     if including:
         # A part uses the macros of the page that includes it.

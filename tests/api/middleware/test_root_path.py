@@ -73,7 +73,7 @@ def test_redirects_and_cookies_are_below_the_prefix(http: TestClient, below: Set
     assert http.get(f"{PREFIX}/").status_code == 200
 
 
-def test_the_api_tells_where_it_is(http: TestClient, services: Services) -> None:
+def test_api_and_client_work_below_a_prefix(http: TestClient, services: Services, tmp_path: Any) -> None:
     finish_all(services, job := add_job(services))
     assert f"{BASE_URL}{PREFIX}/v1/shards/" in http.get(f"{PREFIX}/jobs/{job.id}").text, "a snippet, too"
     assert http.get(f"{PREFIX}/openapi.json").json()["servers"] == [{"url": PREFIX}]
@@ -81,10 +81,6 @@ def test_the_api_tells_where_it_is(http: TestClient, services: Services) -> None
     assert http.get(made.headers["location"]).json()["id"] == made.json()["id"]
     problem = http.get(f"{PREFIX}/v1/jobs/none").json()
     assert http.get(problem["type"]).status_code == 200
-
-
-def test_the_client_works_below_a_prefix(http: TestClient, services: Services, tmp_path: Any) -> None:
-    finish_all(services, job := add_job(services))
 
     def forward(request: httpx.Request) -> httpx.Response:
         answer = http.request(request.method, str(request.url))
@@ -95,13 +91,10 @@ def test_the_client_works_below_a_prefix(http: TestClient, services: Services, t
         assert client.save(shard.file, tmp_path / "x.h5").stat().st_size > 0
 
 
-def test_what_is_no_address_of_this_host_stays() -> None:
+def test_addresses_of_this_host_alone_get_the_prefix() -> None:
     links = '<a href="//cdn/x"><a href="https://x/"><a href="#x"><a href="?x">'
     same = f'<p title="/x">="/x"</p>{links}<input value="/jobs">'
     assert with_prefix(same, PREFIX) == same
-
-
-def test_a_redirect_to_this_host_gets_the_prefix() -> None:
     prefixed = {"/x?a=/b#c": "/graspd/x?a=/b#c", "http://me/x": "http://me/graspd/x"}
     for where, expected in (prefixed | {other: other for other in ("http://you/x", "x", "?x")}).items():
         assert RootPath(create_app, prefix=PREFIX)._below(where, "me") == expected  # type: ignore[arg-type]

@@ -1,6 +1,7 @@
-"""`/v1/jobs`: submit, list, watch, cancel, retry."""
+"""`/v1/jobs`, `/v1/datasets` and `/v1/object-sets`: submit, list, watch, cancel, retry, refusals."""
 
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from graspd.service.model.planning import plan_tasks
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.records import publish_record
 from tests.api.factories import add_job, fail, finish, finish_all
-from tests.service.pipeline.test_fidelity_choice import scene_chart
+from tests.fakes import plan_all, record_of
+from tests.service.pipeline.test_fidelity_choice import CHART, scene_chart
 from tests.waiting import until
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 64, "scenes": 1, "views": 1}
@@ -143,10 +145,8 @@ def test_neighbours_are_named_and_come_back_with_their_digests(http: TestClient)
     job = http.post("/v1/jobs", json={**PAIR, "scene": "bin", "neighbours": ["block", {"object": "bottle"}]}).json()
     assert [one["object"] for one in job["request"]["neighbours"]] == ["block", "bottle"]
     assert job["request"]["neighbours"][0]["digest"] == block
-    page = http.get(f"/jobs/{job['id']}").text
-    assert "in a bin with neighbours block, bottle" in page
-    again = http.post("/v1/jobs", json=job["request"])
-    assert again.json()["id"] == job["id"], "what was read can be sent again"
+    assert "in a bin with neighbours block, bottle" in http.get(f"/jobs/{job['id']}").text
+    assert http.post("/v1/jobs", json=job["request"]).json()["id"] == job["id"], "what was read can be sent again"
     unknown = http.post("/v1/jobs", json={**PAIR, "scene": "bin", "neighbours": ["teapot"]})
     assert (unknown.status_code, unknown.headers["content-type"]) == (404, "application/problem+json")
     assert "there is no object 'teapot'" in unknown.json()["detail"]
@@ -173,3 +173,101 @@ def test_the_form_asks_for_a_scene_and_neighbours(http: TestClient) -> None:
     assert page.status_code == 422 and "neighbours need a scene" in page.text
     assert 'value="block"' in page.text, "what was typed stays"
     assert http.post("/submit", data=form | {"neighbours": "teapot"}).status_code == 404
+
+
+WANTED = {"name": "kitchen", "hands": ["allegro", "barrett"], "objects": ["mug", "block"], "grasps": 64}
+
+
+@pytest.fixture
+def kitchen(http: TestClient) -> dict[str, Any]:
+    answer = http.post("/v1/datasets", json=WANTED)
+    assert answer.status_code == 202
+    return answer.json()
+
+
+def finish_cells(services: Services, http: TestClient, count: int) -> None:
+    plan_all(services)
+    for cell in http.get("/v1/datasets/kitchen/cells").json()["items"][:count]:
+        finish_all(services, record_of(services, cell["job_id"]))
+
+
+def test_a_new_dataset_has_a_place_and_a_done_one_is_found(http: TestClient, services: Services) -> None:
+    answer = http.post("/v1/datasets", json=WANTED)
+    assert answer.status_code == 202
+    assert answer.headers["Location"] == "/v1/datasets/kitchen" and answer.headers["Retry-After"] == "1"
+    dataset = http.get("/v1/datasets/kitchen").json()
+    assert dataset == answer.json()
+    assert (dataset["cells"], dataset["state"], dataset["asked"]) == (4, "queued", 256)
+    assert [one["name"] for one in http.get("/v1/datasets").json()["items"]] == ["kitchen"]
+    finish_cells(services, http, 4)
+    again = http.post("/v1/datasets", json=WANTED)
+    assert again.status_code == 200 and again.json()["state"] == "succeeded"
+
+
+def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, services: Services) -> None:
+    wanted = WANTED | {"fidelity": "auto", "target": "gsr>=0.6"}
+    unnamed = {key: value for key, value in wanted.items() if key != "name"}
+    for path, body in (("/v1/datasets", wanted), ("/v1/datasets/estimate", unnamed)):
+        answer = http.post(path, json=body)
+        assert answer.status_code == 422 and "graspd chart --publish" in answer.text
+    publish_record(services.store, "charts", CHART)
+    assert http.post("/v1/datasets", json=wanted).status_code == 202
+    cells = http.get("/v1/datasets/kitchen/cells").json()["items"]
+    assert {(cell["hand"], cell["fidelity"]) for cell in cells} == {("allegro", "standard"), ("barrett", "draft")}
+    assert "auto (gsr&gt;=0.6)" in http.get("/datasets/kitchen").text
+
+
+def test_cells_come_in_pages_with_a_next_link(http: TestClient, services: Services, kitchen: dict[str, Any]) -> None:
+    finish_cells(services, http, 1)
+    first = http.get("/v1/datasets/kitchen/cells", params={"limit": 3})
+    address = first.headers["Link"].partition(">")[0].lstrip("<")
+    cells = first.json()["items"] + http.get(address).json()["items"]
+    pairs = [(cell["hand"], cell["object"]) for cell in cells]
+    assert pairs == [("allegro", "mug"), ("allegro", "block"), ("barrett", "mug"), ("barrett", "block")]
+    assert [cell["state"] for cell in cells] == ["succeeded", "queued", "queued", "queued"]
+    done = http.get("/v1/datasets/kitchen/cells", params={"state": "succeeded"}).json()["items"]
+    assert [cell["position"] for cell in done] == [0]
+
+
+def test_what_cannot_be_made_is_refused(http: TestClient) -> None:
+    for changes, status, words in (
+        ({"hands": ["foot"]}, 404, "there is no hand 'foot'"),
+        ({"objects": []}, 422, "needs objects"),
+        ({"views": 2}, 422, "views need scenes"),
+        ({"scene": "bin", "neighbours": ["teapot"]}, 404, "there is no object 'teapot'"),
+        ({"name": "../etc"}, 422, "name"),
+        ({"colour": "red"}, 422, "colour"),
+    ):
+        answer = http.post("/v1/datasets", json=WANTED | changes)
+        assert answer.status_code == status and words in answer.json()["detail"]
+    assert http.get("/v1/datasets").json()["items"] == []
+
+
+def test_an_estimate_records_nothing(http: TestClient) -> None:
+    matrix = {key: value for key, value in WANTED.items() if key != "name"}
+    found = http.post("/v1/datasets/estimate", json=matrix | {"grasps": 1_000_000, "scenes": 1}).json()
+    assert found["asked"] == 4_000_000 and [plan["workers"] for plan in found["plans"]] == [1, 8, 64]
+    assert all(rate["origin"].startswith("stored default") for rate in found["rates"])
+    assert http.get("/v1/datasets").json()["items"] == []
+
+
+def test_a_snapshot_is_made_once_with_checksums(http: TestClient, services: Services, kitchen: dict[str, Any]) -> None:
+    assert http.post("/v1/datasets/kitchen/snapshots").status_code == 409
+    finish_cells(services, http, 2)
+    taken = http.post("/v1/datasets/kitchen/snapshots")
+    assert taken.status_code == 201 and taken.json()["shards"] == 4 and not taken.json()["complete"]
+    assert http.post("/v1/datasets/kitchen/snapshots").status_code == 200
+    assert http.get("/v1/datasets/kitchen/snapshots").json()["items"] == [taken.json()]
+    whole = http.get(taken.headers["Location"]).json()
+    for shard in whole["shards"]:
+        assert shard["sha256"] == http.get(f"/v1/shards/{shard['id']}").json()["sha256"]
+
+
+def test_objects_get_a_name_together_and_make_a_dataset(http: TestClient) -> None:
+    answer = http.post("/v1/object-sets", json={"name": "all", "objects": ["mug", "bottle", "block"]})
+    assert answer.status_code == 201 and answer.headers["Location"] == "/v1/object-sets/all"
+    assert http.get("/v1/object-sets").json() == [http.get("/v1/object-sets/all").json()]
+    dataset = http.post("/v1/datasets", json={"name": "d", "hands": ["allegro"], "sets": ["all"]}).json()
+    assert dataset["objects"] == ["block", "bottle", "mug"]
+    assert http.post("/v1/object-sets", json={"name": "all", "objects": ["moon"]}).status_code == 404
+    assert http.get("/v1/object-sets/none").status_code == 404

@@ -50,12 +50,14 @@ def test_half_a_file_is_completed_only_where_it_is_the_same(http: TestClient, fi
         assert (answer.status_code, answer.content) == wanted
 
 
-def test_head_says_what_get_would_and_sends_nothing(http: TestClient, file: str) -> None:
+def test_head_says_what_get_would_sends_nothing_and_is_counted(http: TestClient, file: str, app: FastAPI) -> None:
     same = ("content-length", "content-type", "etag", "cache-control", "accept-ranges")
     for address in (file, MODEL):
         whole, head = http.get(address), http.head(address, headers={"Range": "bytes=0-9"})
         assert (head.status_code, head.content) == (200, b"")
         assert {name: head.headers.get(name) for name in same} == {name: whole.headers.get(name) for name in same}
+    http.head("/healthz")
+    assert 'method="HEAD",route="/healthz"' in app.state.metrics.render(app.state.overview.snapshot()).decode()
 
 
 def _kind(answer: Response) -> tuple[int, str | None]:
@@ -70,11 +72,6 @@ def test_head_is_answered_wherever_get_is(app: FastAPI, http: TestClient) -> Non
     answers = {path: (http.get(path), http.head(path)) for path in asked}
     differing = [path for path, (get, head) in answers.items() if head.content or _kind(head) != _kind(get)]
     assert not differing
-
-
-def test_head_is_logged_and_counted_as_head(app: FastAPI, http: TestClient) -> None:
-    http.head("/healthz")
-    assert 'method="HEAD",route="/healthz"' in app.state.metrics.render(app.state.overview.snapshot()).decode()
 
 
 def test_an_encoded_body_is_refused_by_its_encoding(http: TestClient) -> None:

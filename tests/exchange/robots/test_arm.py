@@ -114,8 +114,7 @@ def test_base_without_an_arm_and_an_arm_without_mink_are_refused(free_shard, arm
     words = "export --format csv"
     assert "--arm ARM.urdf" in refused(words, free_shard, "--base", "0 0 0 1 0 0 0", "-o", tmp_path)
     monkeypatch.setitem(sys.modules, "mink", None)
-    said = refused(f"{words} --mount flange --arm", arm, free_shard, "-o", tmp_path)
-    assert "pip install 'graspd[arm]'" in said
+    assert "pip install 'graspd[arm]'" in refused(f"{words} --mount flange --arm", arm, free_shard, "-o", tmp_path)
 
 
 def test_speeds_that_the_arm_does_not_state_are_assumed_and_told(free_shard: Path, tmp_path: Path) -> None:

@@ -222,7 +222,9 @@ def build_a_history(services: Services) -> None:
     finish(services, shared.id)
 
 
-def test_a_rebuild_from_the_store_gives_the_rows_that_are_there(services: Services) -> None:
+def test_a_rebuild_gives_the_rows_that_are_there_or_leaves_the_old_ones(
+    services: Services, monkeypatch: pytest.MonkeyPatch
+) -> None:
     build_a_history(services)
 
     def rows() -> tuple[object, ...]:
@@ -236,6 +238,11 @@ def test_a_rebuild_from_the_store_gives_the_rows_that_are_there(services: Servic
     rebuild(services.index, services.store)
     assert differences(services.index, services.store) == []
     assert rows() == before
+    jobs = len(services.index.jobs.page(limit=99).items)
+    monkeypatch.setattr(Store, "get", Mock(side_effect=StoreUnavailable("away")))
+    with pytest.raises(StoreUnavailable):
+        rebuild(services.index, services.store)
+    assert len(services.index.jobs.page(limit=99).items) == jobs
 
 
 def test_every_kind_of_damage_to_the_index_is_seen_and_mended(services: Services) -> None:
@@ -251,15 +258,6 @@ def test_every_kind_of_damage_to_the_index_is_seen_and_mended(services: Services
         assert any(words in line for line in found)
     rebuild(services.index, services.store)
     assert differences(services.index, services.store) == []
-
-
-def test_a_rebuild_that_breaks_off_leaves_the_old_rows(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
-    build_a_history(services)
-    jobs = len(services.index.jobs.page(limit=99).items)
-    monkeypatch.setattr(Store, "get", Mock(side_effect=StoreUnavailable("away")))
-    with pytest.raises(StoreUnavailable):
-        rebuild(services.index, services.store)
-    assert len(services.index.jobs.page(limit=99).items) == jobs
 
 
 #: What is searched for, and the ways of the search: what it sorts at once, and how many rows it looks at in turn.

@@ -1,8 +1,22 @@
-"""What projects used, day by day, and whose turn it is when they share the queue."""
+"""What the index adds up: usage of projects, fair scheduling, statistics held against NumPy; its tables as Parquet."""
 
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sqlalchemy import insert, select
+
+from graspd.service.index.export import TABLES, export
+from graspd.service.index.index import Index
+from graspd.service.index.queries.grasps import GraspFilter
 from graspd.service.index.rebuild import rebuild
+from graspd.service.index.tables import METRICS, grasps, shards
 from graspd.service.index.views import UsageDay
 from graspd.service.model import names
+from graspd.service.model.errors import InputError
 from graspd.service.model.messages import Origin
 from graspd.service.model.planning import RoundRobin, message_of, plan_tasks
 from graspd.service.model.projects import ProjectScope
@@ -12,6 +26,7 @@ from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.records import put_record
 from tests.fakes import make_shard, make_task, request
+from tests.indexes import empty_index
 
 DAY, NEXT = "2026-11-20", "2026-11-21"
 
@@ -60,8 +75,7 @@ def test_what_was_made_is_summed_for_each_project_and_day(services: Services) ->
 
 def test_a_shard_that_two_projects_want_is_charged_to_the_first(services: Services) -> None:
     first = enter(services, "red", 1)
-    second = first.model_copy(update={"id": "f" * 32, "project": "blue"})
-    services.index.write.add_job(second)
+    services.index.write.add_job(first.model_copy(update={"id": "f" * 32, "project": "blue"}))
     make(services, first)
     (day,) = services.index.usage.days(DAY, DAY)
     assert (day.project, day.tasks) == ("red", 1)
@@ -105,3 +119,96 @@ def test_projects_share_the_queue_evenly(services: Services) -> None:
         for task in ready:
             queued[services.index.jobs.get(task.job.id).project] += 1
     assert queued == {"greedy": 10, "modest": 10, "": 10}
+
+
+COUNT = 500
+BINS = 12
+CREATED = "2026-01-01T00:00:00Z"
+
+
+@pytest.fixture
+def values() -> np.ndarray:
+    return np.random.default_rng(7).gamma(2.0, 0.3, COUNT)
+
+
+@pytest.fixture
+def index(tmp_path: Path, values: np.ndarray) -> Iterator[Index]:
+    opened = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
+    plain = dict.fromkeys(METRICS) | {"shard_id": "a" * 32, "hand": "h", "object": "o", "created": CREATED}
+    rows = [plain | {"row": row, "epsilon": value, "valid": row % 2 == 0} for row, value in enumerate(values)]
+    with opened.database.write_transaction() as connection:
+        connection.execute(insert(grasps), rows)
+    yield opened
+    opened.close()
+
+
+def test_summaries_and_histograms_are_those_of_numpy(index: Index, values: np.ndarray) -> None:
+    summaries = index.statistics.summaries(GraspFilter(valid=True), ("epsilon", "contact_area_cm2"))
+    found, passed = summaries.pop("epsilon"), values[::2]
+    assert found.count == len(passed) and summaries == {}
+    assert (found.mean, found.low, found.high) == pytest.approx((passed.mean(), passed.min(), passed.max()))
+    assert index.statistics.summaries(GraspFilter(hand="other"), ("epsilon",)) == {}
+    low, high, one = float(values.min()), float(values.max()), float(values[3])
+    expected, _ = np.histogram(values, BINS, (low, high))
+    assert index.statistics.histogram(GraspFilter(), "epsilon", low, high, BINS) == expected.tolist()
+    assert index.statistics.histogram(GraspFilter(), "epsilon", one, one, BINS) == [1] + [0] * (BINS - 1)
+
+
+def test_distributions_of_few_grasps_are_exact(index: Index, values: np.ndarray) -> None:
+    found = index.statistics.compare_distributions(
+        [GraspFilter(valid=True)], ("epsilon", "contact_area_cm2"), bins=BINS
+    )
+    passed = values[::2]
+    ((one,),) = found.values()
+    assert one is not None and one.counts == np.histogram(passed, BINS)[0].tolist()
+    assert one.mean == pytest.approx(passed.mean())
+
+
+def test_distributions_of_many_grasps_come_from_a_fair_sample(index: Index) -> None:
+    with index.database.write_transaction() as connection:
+        for number in range(400):
+            shard = hashlib.sha256(str(number).encode()).hexdigest()[:32]
+            made = {"shard_id": shard, "hand": "a", "object": "b", "created": CREATED, "valid": True}
+            connection.execute(insert(grasps), [made | {"row": row, "epsilon": number / 400} for row in range(8)])
+            connection.execute(insert(shards), _shard(shard, hand="a", object="b", count=8))
+    (found,) = index.statistics.compare_distributions([GraspFilter(hand="a", object="b")], ("epsilon",), at_most=800)[
+        "epsilon"
+    ]
+    # 100 shards are expected; the number drawn has a standard deviation of 9, their mean one of 0.03.
+    assert found is not None and 60 * 8 < found.count < 140 * 8
+    assert found.mean == pytest.approx(0.5, abs=0.12)
+
+
+def _shard(shard: str, **fields: object) -> dict[str, object]:
+    texts = dict.fromkeys(("key", "sha256", "hand_digest", "object_digest", "device", "worker", "created"), "x")
+    numbers = dict.fromkeys(("size_bytes", "valid", "batch", "seed", "seconds"), 0)
+    return {"id": shard, "kind": "base", "stage": "synthesize", "inputs": [], "manifest": {}} | texts | numbers | fields
+
+
+def test_every_row_and_value_of_a_table_is_in_its_file(services: Services, tmp_path: Path, monkeypatch) -> None:
+    pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
+    monkeypatch.setattr("graspd.service.index.export.GROUP", 7)  # several groups of rows, the last one not full
+    make(services, enter(services, "vision", 1, batches=2))
+    counts = export(services.index.database, tmp_path)
+    assert counts["grasps"] == 64 and counts["jobs"] == 1 and counts["shards"] == counts["tasks"] > 1
+    with services.index.database.read_transaction() as connection:
+        for name, table in TABLES.items():
+            stored = [
+                {key: json.dumps(value) if isinstance(value, dict | list) else value for key, value in row.items()}
+                for row in connection.execute(select(table).order_by(*table.primary_key.columns)).mappings()
+            ]
+            found = pq.read_table(tmp_path / f"{name}.parquet")
+            assert found.schema.names == [column.name for column in table.columns], "also of a table without rows"
+            assert found.to_pylist() == stored
+            assert len(stored) == counts[name]
+
+
+def test_no_table_holds_what_is_secret(services: Services, tmp_path: Path) -> None:
+    columns = {column.name for table in TABLES.values() for column in table.columns}
+    assert not {name for name in columns if "secret" in name or "token" in name or "url" in name}
+
+
+def test_without_pyarrow_the_fix_is_told(services: Services, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(InputError, match=r"graspd\[parquet\]"):
+        export(services.index.database, tmp_path)

@@ -44,10 +44,12 @@ def shard(stage: Stage, wanted: JobRequest) -> str:
 BASE = Stage.SYNTHESIZE
 
 
-def test_other_options_make_another_shard_of_grasps_alone() -> None:
+def test_options_of_the_method_make_another_shard_and_a_distance_of_candidates_none() -> None:
     plain, changed = request(method="graspit"), request(method="graspit", options={"steps": 40_000})
     assert shard(BASE, plain) != shard(BASE, changed)
     assert shard(Stage.SCENE, plain) == shard(Stage.SCENE, changed)
+    raw = request(want="candidates")
+    assert shard(BASE, request(want="candidates", min_distance=0.02)) == shard(BASE, raw)
 
 
 def test_a_default_stays_out_of_documents_and_ids_and_another_value_moves_the_grasps() -> None:
@@ -58,11 +60,6 @@ def test_a_default_stays_out_of_documents_and_ids_and_another_value_moves_the_gr
     assert len({job_id(one, HAND, OBJECT) for one in (plain, *others)}) == 4
     assert shard(BASE, others[0]) != shard(BASE, plain)
     assert [JobRequest.model_validate_json(one.model_dump_json()) for one in others] == others
-
-
-def test_candidate_grasps_do_not_depend_on_the_distance() -> None:
-    raw = request(want="candidates")
-    assert shard(BASE, request(want="candidates", min_distance=0.02)) == shard(BASE, raw)
 
 
 def test_a_wanted_share_is_of_eight_models_unless_told() -> None:
@@ -93,15 +90,12 @@ def test_audits_of_the_default_take_a_twentieth_of_a_jobs_time(seed: int, batche
     assert price <= 0.05
 
 
-def test_half_of_many_short_jobs_are_audited_and_a_long_one_has_all() -> None:
+def test_half_of_many_short_jobs_are_rechecked_and_a_long_one_has_all() -> None:
     first = [request(seed=seed).rechecks_of(0) for seed in range(200)]
     assert 70 < sum(first) < 130
     assert {first[k] + request(seed=k).rechecks_of(1) for k in range(200)} == {1}
     for seed in range(6):
         assert sum(request(seed=seed).rechecks_of(batch) for batch in range(100)) == RECHECKS
-
-
-def test_any_other_number_is_of_the_first_grasps() -> None:
     assert [request(rechecks=40).rechecks_of(batch) for batch in range(3)] == [32, 8, 0]
     assert request(rechecks=40, validation="dexgraspbench").rechecks_of(0) == 0
 

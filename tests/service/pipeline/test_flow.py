@@ -169,9 +169,12 @@ def test_turns_are_short_and_alternate(services: Services, work_off: WorkOff) ->
     assert differences(services.index, services.store) == []
 
 
-def test_a_job_is_told_whole_before_it_is_entered(services: Services) -> None:
+def test_a_job_is_told_whole_and_the_same_again_begins_nothing_anew(services: Services, work_off: WorkOff) -> None:
     job, _ = job_actions.submit(services, request(grasps=LARGE))
     assert [(stage.tasks, stage.queued) for stage in job.stages] == [(LARGE // 32, LARGE // 32)]
+    work_off()
+    again, new = job_actions.submit(services, request(grasps=LARGE))
+    assert (again.id, new, services.index.write.partly_entered_jobs()) == (job.id, False, [])
 
 
 def test_a_job_that_is_being_entered_has_not_ended(services: Services, work_off: WorkOff) -> None:
@@ -182,13 +185,6 @@ def test_a_job_that_is_being_entered_has_not_ended(services: Services, work_off:
     work_off()
     assert services.index.jobs.get(job.id).state is State.CANCELLED
     assert differences(services.index, services.store) == []
-
-
-def test_the_same_job_again_begins_nothing_anew(services: Services, work_off: WorkOff) -> None:
-    job, _ = job_actions.submit(services, request(grasps=LARGE))
-    work_off()
-    again, new = job_actions.submit(services, request(grasps=LARGE))
-    assert (again.id, new, services.index.write.partly_entered_jobs()) == (job.id, False, [])
 
 
 def test_a_job_whose_record_is_gone_is_given_up(services: Services, work_off: WorkOff) -> None:

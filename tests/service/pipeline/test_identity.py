@@ -44,25 +44,26 @@ def test_a_second_service_on_a_store_is_refused(first: Services, tmp_path: Path)
     assert second.queue.service() is None
 
 
-def test_a_second_service_on_a_redis_is_refused(first: Services, tmp_path: Path) -> None:
+def test_a_second_service_on_a_redis_is_refused_also_at_once(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second", queue=first.queue)
     for take_over in (False, False, True):
         with pytest.raises(BusyError, match=r"Redis belongs to another graspd service.*GRASPD_REDIS_URL"):
             identify(second, take_over=take_over)
-
-
-def test_of_two_that_begin_on_one_redis_one_is_refused(first: Services, tmp_path: Path) -> None:
     queue = Mock(first.queue, service=Mock(side_effect=[None, first.queue.service()]))
     with pytest.raises(BusyError, match="Redis belongs to another"):
-        identify(service(tmp_path / "second", queue=queue))
+        identify(service(tmp_path / "third", queue=queue))
 
 
-def test_a_worker_of_another_store_is_refused(first: Services, tmp_path: Path) -> None:
+def test_a_worker_or_an_index_of_another_store_is_refused(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second")
     assert not check_service(second.store, second.queue.service())
     assert check_service(first.store, first.queue.service())
     with pytest.raises(BusyError, match="Redis belongs to another"):
         check_service(second.store, first.queue.service())
+    identify(second)
+    mixed = Services(first.settings, first.store, second.index, MemoryQueue())
+    with pytest.raises(BusyError, match="the index belongs to another graspd service"):
+        identify(mixed)
 
 
 def test_processes_that_begin_a_service_at_once_agree(tmp_path: Path) -> None:
@@ -73,12 +74,9 @@ def test_processes_that_begin_a_service_at_once_agree(tmp_path: Path) -> None:
     assert len(service_ids(one.store)) == 1
 
 
-def test_a_lost_redis_becomes_the_services_again(first: Services) -> None:
+def test_a_lost_redis_or_index_becomes_the_services_again(first: Services, tmp_path: Path) -> None:
     emptied = Services(first.settings, first.store, first.index, MemoryQueue())
     assert identify(emptied) == emptied.queue.service() == first.queue.service()
-
-
-def test_an_index_elsewhere_or_a_lost_one_is_the_services(first: Services, tmp_path: Path) -> None:
     other = service(tmp_path / "other", store=first.store, queue=first.queue)
     assert identify(other) == first.index.notes.service() == other.index.notes.service()
 
@@ -122,14 +120,6 @@ def test_a_service_that_takes_over_is_the_only_one_from_then_on(first: Services,
     assert identify(first, take_over=True) == first.queue.service() != mine
     with pytest.raises(BusyError, match="was taken over"):
         identify(second)
-
-
-def test_an_index_of_another_store_is_refused(first: Services, tmp_path: Path) -> None:
-    second = service(tmp_path / "second")
-    identify(second)
-    mixed = Services(first.settings, first.store, second.index, MemoryQueue())
-    with pytest.raises(BusyError, match="the index belongs to another graspd service"):
-        identify(mixed)
 
 
 def test_a_controller_ends_when_its_store_is_taken_over(first: Services, tmp_path: Path) -> None:

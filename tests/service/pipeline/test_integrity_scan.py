@@ -68,8 +68,7 @@ def full(services: Services) -> Services:
     job, _ = job_actions.submit(services, request(grasps=96))
     record = read_record(JobRecord, store, names.job_record_key(job.id))
     lone, first, _ = tasks_of(record)
-    manifest = make_shard(store, lone)
-    services.index.write.add_manifests([manifest])
+    services.index.write.add_manifests([make_shard(store, lone)])
     add_job_event(store, job.id, "cancelled")
     attempt = {"task_id": first.task_id, "job_id": job.id, "stage": Stage.SYNTHESIZE, "number": 1, "kind": "Error"}
     failed = AttemptRecord(**attempt, reason="broke", worker="w", ended=timestamp(), last=False)
@@ -146,18 +145,14 @@ def test_what_an_earlier_graspd_wrote_is_read_and_counted(services: Services) ->
     assert {key, zipped} <= set(without)
 
 
-def test_files_of_an_earlier_upload_are_held_against_their_name(services: Services) -> None:
-    key = names.asset_files_key(AssetKind.HAND, services.index.assets.get(AssetKind.HAND, "gripper").digest)
-    overwrite(services.store, key, pack_files(HAND_FILES | {"hand.urdf": b"<robot name='other'/>"}))
-    wrong = examine(services.store, key)
-    assert wrong is not None and "its files do not match its name" in wrong.what
-
-
-def test_a_damaged_upload_is_replaced_by_the_same_files(services: Services) -> None:
+def test_files_of_an_upload_replace_damaged_ones_and_match_their_name(services: Services) -> None:
     key = names.asset_files_key(AssetKind.HAND, services.index.assets.get(AssetKind.HAND, "gripper").digest)
     overwrite(services.store, key, flipped(services.store.get(key)))
     store_files(services.store, AssetKind.HAND, "gripper", HAND_FILES)
     assert examine(services.store, key) is None
+    overwrite(services.store, key, pack_files(HAND_FILES | {"hand.urdf": b"<robot name='other'/>"}))
+    wrong = examine(services.store, key)
+    assert wrong is not None and "its files do not match its name" in wrong.what
 
 
 @pytest.mark.parametrize("file", ["model.glb", "check.json"])

@@ -31,14 +31,13 @@ def test_the_same_request_is_the_same_job(services: Services) -> None:
     assert len(services.queue.waiting()) == 1
 
 
-def test_an_unknown_hand_or_object_leaves_nothing_behind(services: Services) -> None:
+def test_an_unknown_hand_or_a_lost_redis_leaves_nothing_behind(
+    services: Services, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for changes in ({"hand": "unknown"}, {"object": "unknown"}):
         with pytest.raises(NotFoundError, match="unknown"):
             job_actions.submit(services, request(**changes))
     assert list(services.store.list(names.JOBS)) == []
-
-
-def test_without_redis_nothing_is_recorded_of_a_submit(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(services.queue, "ping", Mock(side_effect=QueueUnavailable("Redis does not answer")))
     with pytest.raises(QueueUnavailable):
         job_actions.submit(services, request())
@@ -174,8 +173,7 @@ def test_grasps_are_found_by_their_scene(services: Services) -> None:
         return len(services.index.grasps.page(GraspFilter.model_validate(where), limit=200).items)
 
     assert [count(scene=kind) for kind in ("free", "table", "bin", "shelf", "any", None)] == [32, 32, 32, 0, 64, 96]
-    held = count(scene="table", lift_hard=True)
-    assert held == count(scene="table", valid=True) > 0
+    assert count(scene="table", lift_hard=True) == count(scene="table", valid=True) > 0
     assert count(lift_hard=True, scene="free") == 0
     half = GraspFilter(at_least={"clearance_m": 0.5})
     far = services.index.grasps.page(half, sort=GraspSort(by="clearance_m"), limit=200).items

@@ -182,12 +182,11 @@ def test_cells_of_a_dataset_share_the_workers(services: Services, cells: int, ta
     actions.create(services, DatasetRequest(name="d", hands=("gripper",), objects=objects, grasps=32 * 16))
     assert services.index.datasets.get("d").tasks == 16 * cells, "with a batch a task, until it is known"
     plan_all(services)
-    dataset = services.index.datasets.get("d")
-    assert dataset.tasks == tasks * cells
+    assert services.index.datasets.get("d").tasks == tasks * cells
     assert {cell.tasks for cell in services.index.datasets.cells("d").items} == {tasks}
 
 
-def test_a_small_job_goes_batch_by_batch_but_on_a_gpu(services: Services) -> None:
+def test_small_jobs_pictures_and_older_workers_go_batch_by_batch(services: Services) -> None:
     measured(services, 0.01)
     here(services, worker())
     assert span(services, 128, Priority.INTERACTIVE) == 1
@@ -195,10 +194,6 @@ def test_a_small_job_goes_batch_by_batch_but_on_a_gpu(services: Services) -> Non
     assert span(services, 128, Priority.INTERACTIVE) == 4
     here(services, worker("a", device="cuda:0"), worker("b"))
     assert span(services, 128, Priority.INTERACTIVE) == 1
-
-
-def test_pictures_and_older_workers_keep_one_batch_a_task(services: Services) -> None:
-    measured(services, 0.01)
     here(services, worker())
     assert span(services, 3200, scenes=1, views=1) == 1
     assert span(services, 3200, scenes=1) > 1

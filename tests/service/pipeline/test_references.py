@@ -242,13 +242,10 @@ def test_a_retried_job_sets_out_from_the_network_it_had(services: Services) -> N
     assert queue.take("w").message.request.network == net
 
 
-def test_only_workers_that_know_networks_are_asked_for_one(services: Services) -> None:
+def test_workers_that_know_networks_are_asked_for_one_of_this_method(services: Services) -> None:
     add_network(services)
     jobs = NETWORK.submit(services), NETWORK.submit(services, method="fast_graspd", options={})
     asked = [message_of(job, next(plan_tasks(job)), attempt=1, max_attempt=3).schema_ for job in jobs]
     assert asked == [SCHEMA_OF_NETWORKS, OLDEST_TASK_SCHEMA]
-
-
-def test_an_option_of_another_method_is_no_network(services: Services) -> None:
     job = NETWORK.submit(services, method="mine", options={"network": "what I call so"})
     assert job.request.options == {"network": "what I call so"} and len(job.assets) == 2

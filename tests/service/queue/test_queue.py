@@ -176,14 +176,11 @@ def test_a_lease_says_who_holds_which_attempt_of_what(queue: RqQueue, worker: Wo
     assert queue.leases() == []
 
 
-def test_a_lease_changes_with_each_beat_and_not_by_reading(queue: RqQueue, busy: Worker) -> None:
+def test_a_lease_changes_with_each_beat_until_it_is_released(queue: RqQueue, busy: Worker) -> None:
     first = queue.leases()[0].beat
     assert queue.leases()[0].beat == first
     assert busy.beat() is None
     assert queue.leases()[0].beat != first
-
-
-def test_a_worker_whose_lease_was_released_notices(queue: RqQueue, busy: Worker) -> None:
     queue.release(queue.leases()[0])
     assert queue.leases() == []
     assert busy.beat() is StopReason.LEASE_LOST
@@ -321,8 +318,7 @@ def test_redis_keeps_nothing_of_a_finished_task(rq_queue: RqQueue) -> None:
     rq_queue.enqueue([task()], Priority.BULK)
     side.take()
     side.finish()
-    after = {key for key in rq_queue.connection.keys("*") if b"queues" not in key}
-    assert after == before
+    assert {key for key in rq_queue.connection.keys("*") if b"queues" not in key} == before
 
 
 def test_a_killed_worker_leaves_nothing_in_redis(rq_queue: RqQueue) -> None:

@@ -49,8 +49,7 @@ def picture(pose: Floats, extrinsics: Floats) -> tuple[Floats, NDArray[np.uint8]
         first, second = (-SIZE / 2 - start) / along, (SIZE / 2 - start) / along
     enter, leave = np.minimum(first, second).max(-1), np.maximum(first, second).min(-1)
     box = np.where(enter < leave, enter, np.inf)
-    depth = np.minimum(table, box)
-    return depth, np.where(box < table, 2, np.isfinite(table)).astype(np.uint8)
+    return np.minimum(table, box), np.where(box < table, 2, np.isfinite(table)).astype(np.uint8)
 
 
 def write(folder: Path) -> Path:

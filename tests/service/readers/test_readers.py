@@ -1,4 +1,4 @@
-"""Reading shards back: from files, jobs, snapshots and S3; how pictures and grasps belong together."""
+"""Reading shards back: from files, jobs, snapshots and S3; pictures, trajectories and conditions on grasps."""
 
 import hashlib
 import os
@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -13,13 +14,24 @@ import pytest
 from obstore.store import MemoryStore
 
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
-from graspd.service.model.transforms import compose, pose_from_matrix
+from graspd.service.model.scene_spec import SceneSpec
+from graspd.service.model.transforms import compose, pose_from_matrix, quat_from_axis_angle
+from graspd.service.model.where import LONGEST
 from graspd.service.pipeline.backends import Services
 from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards
 from graspd.service.readers.rows import RowTable
+from graspd.service.readers.trajectories import (
+    Waypoint,
+    point_at,
+    scene_spec_of,
+    slider_positions,
+    trajectory_of,
+    wrists_of,
+)
+from graspd.service.readers.where import compile_expression
 from graspd.service.settings import Settings
 from graspd.service.store.columns import SCHEMAS
-from graspd.service.store.shards import read_shard
+from graspd.service.store.shards import Shard, json_attribute, read_shard
 from graspd.service.store.store import Store, open_store
 from tests.damage import flipped, flipped_values
 from tests.indexes import open_services
@@ -88,7 +100,7 @@ def test_pictures_of_unknown_scenes_are_to_be_rendered_again(box: Path, tmp_path
         Pictures(open_shards(tmp_path / "set"))
 
 
-def test_a_picture_comes_with_its_grasps_in_the_camera_frame(folder: Path) -> None:
+def test_every_picture_is_there_once_with_its_grasps_in_the_camera_frame(folder: Path) -> None:
     shards = open_shards(folder)
     picture = next(sample for sample in Pictures(shards) if len(sample["grasp/hand_pose"]))
     views = read_shard(shards.path(shards.by_id(picture["shard_id"])), kind="views")
@@ -102,10 +114,6 @@ def test_a_picture_comes_with_its_grasps_in_the_camera_frame(folder: Path) -> No
     expected = compose(pose_from_matrix(picture["camera/extrinsics"]), table)
     np.testing.assert_allclose(picture["grasp/hand_pose"], expected, atol=1e-12)  # rounding of float64
     np.testing.assert_array_equal(picture["grasp/base_row"], scene["grasp/base_index"][here])
-
-
-def test_every_picture_is_there_once(folder: Path) -> None:
-    shards = open_shards(folder)
     pictures = Pictures(shards)
     places = {(sample["shard_id"], sample["row"]) for sample in pictures}
     assert len(places) == len(pictures) == 2 * 2 * 2  # batches, scenes, views
@@ -154,8 +162,7 @@ def test_a_full_cache_drops_what_was_unused_longest(services: Services, shards: 
 @pytest.mark.s3
 def test_what_was_read_once_from_s3_needs_the_server_no_more(s3_url: str, s3_server: S3Server, tmp_path: Path) -> None:
     remote = open_services(Settings(data_dir=tmp_path), open_store(s3_url))
-    job = job_in(remote)
-    shards = open_shards(s3_url, job=job, cache=tmp_path / "cache")
+    shards = open_shards(s3_url, job=job_in(remote), cache=tmp_path / "cache")
     assert [shards.path(file).read_bytes() for file in shards] == [remote.store.get(file.key) for file in shards]
     s3_server.kill()
     try:
@@ -237,3 +244,127 @@ def test_a_fork_is_told_to_start_anew(box: Path, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(os, "getpid", lambda: here + 1)
     with pytest.raises(InputError, match="spawn"):
         pictures[0]
+
+
+WAYPOINTS = 4
+
+
+def shard(*, in_scene: bool) -> Shard:
+    arrays: dict[str, np.ndarray] = {}
+    for k, name in enumerate(("pregrasp", "grasp", "squeeze")):
+        arrays[f"{name}/hand_pose"] = np.array([[0.1, 0, 0, 1, 0, 0, 0]], float)
+        arrays[f"{name}/joint_positions"] = np.full((1, 2), 0.1 * k)
+    if in_scene:
+        coming = np.tile([0.1, 0, 0, 1, 0, 0, 0], (1, WAYPOINTS, 1)).astype(float)
+        coming[0, :, 0] = np.linspace(0.2, 0.1, WAYPOINTS)
+        arrays |= {
+            "grasp/approach": coming,
+            "grasp/approach_joint_positions": np.full((1, 2), -0.3),
+            "grasp/lift": np.array([[0.1, 0, 0.1, 1, 0, 0, 0]]),
+        }
+    return Shard("base", {}, arrays)
+
+
+def test_a_way_goes_from_standoff_or_pregrasp_to_lift_or_squeeze():
+    free, way = trajectory_of(shard(in_scene=False), 0), trajectory_of(shard(in_scene=True), 0)
+    assert [point.name for point in free] == ["pregrasp", "grasp", "squeeze"]
+    assert [point.name for point in way if point.name] == ["standoff", "pregrasp", "grasp", "squeeze", "lift"]
+    assert way[0].hand_pose[0] == 0.2
+    assert all((point.joint_positions == -0.3).all() for point in way[:WAYPOINTS])
+    assert way[-1].carried.tolist() == [0, 0, 0.1] and not any(point.carried.any() for point in way[:-1])
+    np.testing.assert_allclose(slider_positions(way), [0, 0.25, 0.5, 0.75, 1, 2, 3, 4])
+    assert point_at(way, 3.5).carried == pytest.approx([0, 0, 0.05]), "half way up"
+
+
+@pytest.mark.parametrize("at", [(-1, 0.2, -0.3), (0.375, 0.15, -0.3), (1.5, 0.1, 0.05), (9, 0.1, 0.2)])
+def test_between_two_postures_positions_and_joints_go_straight(at: tuple[float, float, float]):
+    place, x, joint = at
+    point = point_at(trajectory_of(shard(in_scene=True), 0), place)
+    assert point.hand_pose[0] == pytest.approx(x) and point.joint_positions == pytest.approx([joint, joint])
+
+
+def test_a_turn_is_divided_evenly():
+    ends = quat_from_axis_angle(np.array([0, 0, 1.0]), np.array([0.0, 1.2]))
+    first, last = (
+        Waypoint(name, np.concatenate([np.zeros(3), q]), np.zeros(0), np.zeros(3))
+        for name, q in zip(("grasp", "squeeze"), ends, strict=True)
+    )
+    third = point_at([first, last], 1 / 3).hand_pose[3:]
+    assert third == pytest.approx(quat_from_axis_angle(np.array([0, 0, 1.0]), np.array(0.4)))
+
+
+def test_a_shard_says_its_scene_or_none_and_nonsense_is_refused():
+    spec = SceneSpec(kind="bin")
+    assert scene_spec_of(Shard("base", {}, {})) is None
+    assert scene_spec_of(Shard("base", {"scene": json_attribute(spec.model_dump(mode="json"))}, {})) == spec
+    with pytest.raises(InputError, match="is not a valid scene"):
+        scene_spec_of(Shard("base", {"scene": '{"kind": "moon"}'}, {}))
+
+
+def test_wrists_are_those_of_the_rows_asked_for():
+    one = shard(in_scene=True)
+    assert wrists_of(one, np.array([0])) is None
+    one.arrays["grasp/wrist_positions"] = np.array([[0.1, 0.2], [0.3, 0.4]])
+    assert np.array_equal(wrists_of(one, np.array([1, 1])), [[0.3, 0.4]] * 2)
+
+
+COLUMNS: dict[str, Any] = {
+    "quality/thresholds_m": np.array([0.002, 0.005]),
+    "quality/epsilon": np.array([[0.9, 0.1], [0.0, 0.4], [0.9, np.nan], [0.0, 0.3]]),
+    "quality/penetration_depth_mm": np.array([0.5, 1.5, 0.5, 2.5]),
+    "quality/valid": np.array([1, 1, 1, 0], np.uint8),
+    "quality/success": np.array([1, 1, 1, 0], np.int8),
+    "quality/lift_outcome": np.array([1, 5, 1, 1], np.uint8),
+    "quality/grasp_type": np.array([1, 2, 3, 0], np.int32),
+}
+SAID = {"hand": "allegro", "object": "006_mustard_bottle"}
+
+
+@pytest.mark.parametrize(
+    ("text", "rows"),
+    [
+        ("epsilon > 0.3", [1]),  # the value at 5 mm, not the one at 2 mm
+        ("epsilon>=.3", [1, 3]),
+        ("not epsilon > 0.3", [0, 2, 3]),
+        ("epsilon = 3e-1 or epsilon != 0.1 and valid", [1, 3]),
+        ("(epsilon = 0.3 or epsilon != 0.1) and valid", [1]),
+        ("valid and lift", [0, 2]),
+        ("lift and not held", [3]),
+        ("not validated", []),
+        ("type = power or type = 'lateral'", [0, 2]),
+        ("hand = allegro and object = 006_mustard_bottle and penetration_depth_mm < 1", [0, 2]),
+        ("hand != allegro", []),
+        ("clearance_m > -1", []),  # a shard that lacks a metric fails every comparison with it
+        ("robust >= 0.75 or robust_share < 0.75", []),
+    ],
+)
+def test_an_expression_chooses_what_it_says(text: str, rows: list[int]) -> None:
+    assert np.flatnonzero(compile_expression(text)(COLUMNS, SAID)).tolist() == rows
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "ends where a name"),
+        ("epsilon", "needs a comparison"),
+        ("epsilon >", "ends where a value"),
+        ("epsilon > big", "compared with a number"),
+        ("epsilon > 1 valid", "follows a complete expression"),
+        ("valid > 0", "is a flag"),
+        ("(valid", "not closed"),
+        ("and valid", "where a name is expected"),
+        ("beauty > 1", "there is no 'beauty'; the names are epsilon"),
+        ("type = pinch", "no type 'pinch'"),
+        ("hand < allegro", "a word by = or !="),
+        ("hand = 5", "a word, not with '5'"),
+        ("epsilon > 1; import os", "cannot be read"),
+        ("__import__('os').system('true')", "cannot be read"),
+        ("(" * 200 + "valid" + ")" * 200, "nested"),
+        ("not " * 200 + "valid", "nested"),
+        ("valid and " * LONGEST, "characters long"),
+    ],
+)
+def test_what_is_no_expression_is_refused_in_a_line(text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words) as refused:
+        compile_expression(text)
+    assert "\n" not in str(refused.value)

@@ -256,15 +256,12 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     return monkeypatch
 
 
-def test_where_nothing_is_set_defaults_count_and_nothing_is_loaded(bare: pytest.MonkeyPatch) -> None:
+def test_defaults_count_until_a_value_is_set_and_a_bad_one_is_refused(bare: pytest.MonkeyPatch) -> None:
     whole = load_settings()
     assert engine_settings() == EngineSettings(whole.prefilter, whole.processes)
     code = "import sys; from graspd.service.cli import engine_settings; engine_settings(); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pydantic_settings" not in done.stdout.split()
-
-
-def test_a_set_value_counts_and_a_bad_one_is_refused_by_name(bare: pytest.MonkeyPatch) -> None:
     bare.setenv("graspd_processes", "3")
     assert engine_settings() == EngineSettings("auto", 3)
     bare.setenv("GRASPD_PREFILTER", "perhaps")

@@ -77,15 +77,12 @@ def scribble(file: Path) -> None:
     file.write_bytes(b"no log of Redis " * 20)
 
 
-def make_newer(file: Path) -> None:
-    file.write_bytes(b"REDIS0999" + file.read_bytes()[9:])
-
-
 def cut(file: Path) -> None:
     file.write_bytes(file.read_bytes()[:20])
 
 
-HARMS = {"base.rdb": (make_newer, scribble, cut, Path.unlink), "incr.aof": (scribble,), "manifest": (scribble,)}
+NEWER = lambda file: file.write_bytes(b"REDIS0999" + file.read_bytes()[9:])  # noqa: E731
+HARMS = {"base.rdb": (NEWER, scribble, cut, Path.unlink), "incr.aof": (scribble,), "manifest": (scribble,)}
 
 
 @pytest.mark.parametrize(("name", "harm"), [(f"*.{kind}", harm) for kind, harms in HARMS.items() for harm in harms])

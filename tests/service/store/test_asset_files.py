@@ -152,12 +152,9 @@ def test_a_folder_of_meshes_is_a_set_of_objects(paths: list[str], objects: dict[
     assert {name: sorted(files) for name, files in object_set(dict.fromkeys(paths, b"x")).items()} == objects
 
 
-def test_a_folder_without_a_mesh_is_no_set() -> None:
+def test_a_set_is_a_folder_of_meshes_as_the_reference_objects(shared_data: Path) -> None:
     with pytest.raises(InputError, match="no mesh"):
         object_set({"a.txt": b""})
-
-
-def test_the_reference_objects_are_recognised(shared_data: Path) -> None:
     found = object_set(read_set(shared_data / "objects", limit_bytes=2**26))
     assert len(found) == 14 and list(found["025_mug"]) == ["clean.stl"]
 

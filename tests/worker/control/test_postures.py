@@ -227,7 +227,7 @@ def test_generalized_forces_are_the_gradient_of_work(hand: HandModel) -> None:
         assert found[:, d] == pytest.approx(work, abs=DIFFERENCES)
 
 
-def test_pregrasp_is_clear_and_within_limits() -> None:
+def test_pregrasp_is_clear_within_limits_and_no_farther_than_it_must() -> None:
     hand = two_finger_hand()
     held = posture(((0, 0, -0.095), (0.35, 0.35)), ((0.005, 0, -0.09), (0.25, 0.4)))
     before = pregrasp(hand, BOX, held)
@@ -237,12 +237,7 @@ def test_pregrasp_is_clear_and_within_limits() -> None:
     assert (found.distance[:, fingers].min(axis=1) > opening.CLEARANCE_M - 1e-3).all()
     assert (found.distance.min(axis=1) > 0).all() and (before.joint_positions >= hand.lower - 1e-12).all()
     assert (before.joint_positions < held.joint_positions).all()
-
-
-def test_pregrasp_backs_away_and_opens_no_further_than_it_must() -> None:
-    hand = two_finger_hand()
     found = Probe(hand, BOX).measure(pregrasp(hand, BOX, posture(((0, 0, -0.095), (0.05, 0.05)))))
-    fingers = np.isin(Probe(hand, BOX).points.body, [1, 2])
     # One step of 0.05 rad moves a tip at most 79 mm times that.
     assert found.distance[0, fingers].min() < opening.CLEARANCE_M + 0.05 * 0.079
     touching = posture(((0, 0, -0.025), (-0.2, -0.2)))
@@ -287,14 +282,11 @@ def test_squeeze_never_asks_more_than_the_hand_can() -> None:
     assert pressed[0, 0] == pytest.approx(3.0, rel=0.01)
 
 
-def test_squeeze_respects_a_coupling() -> None:
+def test_squeeze_respects_a_coupling_and_without_contact_is_the_grasp() -> None:
     hand = on_one_dof(two_finger_hand(), 0.5, 0.1)
     joints = hand.expand(np.array([[0.3]]))
     moved = squeeze(hand, BOX, posture(((0, 0, -0.095), tuple(joints[0])))).joint_positions - joints
     assert moved[0, 1] == pytest.approx(0.5 * moved[0, 0])
-
-
-def test_squeeze_without_contact_or_grasps_is_the_grasp() -> None:
     away = posture(((0, 0, 1.0), (0.01, 0.01)))
     assert np.array_equal(squeeze(plate_hand(), BOX, away).joint_positions, away.joint_positions)
     none = Posture(np.zeros((0, 7)), np.zeros((0, 2)))
@@ -377,7 +369,7 @@ def case(request: pytest.FixtureRequest) -> tuple[HandModel, Probe, Posture]:
     return hand, Probe(hand, OBJ, hand_points=600, object_points=64), around(hand, 24)
 
 
-def test_hands_open_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
+def test_hands_open_and_press_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
     hand, probe, grasp = case
     found, wanted = pregrasp(hand, OBJ, grasp), opened_by_numpy(probe, grasp)
     np.testing.assert_allclose(found.joint_positions, wanted.joint_positions, atol=SINGLE)
@@ -385,10 +377,6 @@ def test_hands_open_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
     moved = np.abs(found.joint_positions - grasp.joint_positions).max(axis=1) > 0.01
     retreated = np.linalg.norm((found.hand_pose - grasp.hand_pose)[:, :3], axis=1) > 0
     assert moved.any() and 0 < retreated.sum() < len(grasp)
-
-
-def test_forces_balance_and_idle_fingers_close_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
-    hand, probe, grasp = case
     held = hold_forces(hand, OBJ, grasp, total_normal_force=20.0, friction=0.3)
     command = squeeze(hand, OBJ, grasp, total_normal_force=20.0)
     pressed = (hand.reduce(command.joint_positions) - hand.reduce(grasp.joint_positions)) * hand.stiffness
@@ -399,13 +387,9 @@ def test_forces_balance_and_idle_fingers_close_as_in_numpy(case: tuple[HandModel
     np.testing.assert_allclose(held.torque, torque, atol=1e-7)
     np.testing.assert_allclose(pressed, closing, atol=1e-7)
     assert 0 < np.count_nonzero(held.residual < 1.0) < len(grasp) and np.abs(torque - closing).max() > 1e-3
-
-
-def test_links_in_contact_are_counted_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
-    hand, probe, grasp = case
     near = probe.touch(grasp, reach=LINK_CONTACT_M).distance < LINK_CONTACT_M
-    wanted = [len(np.unique(probe.points.body[one])) for one in near]
-    assert postures.touching_links(hand, OBJ, grasp).tolist() == wanted and len(set(wanted)) > 2
+    links = [len(np.unique(probe.points.body[one])) for one in near]
+    assert postures.touching_links(hand, OBJ, grasp).tolist() == links and len(set(links)) > 2
 
 
 def grasp_of(hand: HandModel) -> Posture:

@@ -5,6 +5,7 @@ import gzip
 import io
 import json
 import struct
+from typing import Any
 
 import numpy as np
 import pytest
@@ -134,23 +135,17 @@ def test_the_node_tree_of_a_glb_places_and_mirrors_its_mesh() -> None:
     assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() > 0
 
 
-def promise(name: str) -> bytes:
-    """A small file whose header promises more than fits in memory."""
-    match name:
-        case "m.stl":
-            return b"\0" * 80 + struct.pack("<I", 4_000_000_000) + b"\0" * 100
-        case "m.off":
-            return b"OFF\n4000000000 4000000000 0\n0 0 0\n"
-        case _:
-            head = b"ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty float x\n"
-            head += b"property float y\nproperty float z\nelement face 1\n"
-            return head + b"property list uint int vertex_indices\nend_header\n" + b"\0" * 64
+#: Small files whose headers promise more than fits in memory.
+PLY_HEAD = b"ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty float x\nproperty float y\n"
+PLY_HEAD += b"property float z\nelement face 1\nproperty list uint int vertex_indices\nend_header\n"
+PROMISES = {"m.stl": bytes(80) + struct.pack("<I", 4_000_000_000) + bytes(100), "m.ply": PLY_HEAD + bytes(64)}
+PROMISES |= {"m.off": b"OFF\n4000000000 4000000000 0\n0 0 0\n"}
 
 
-@pytest.mark.parametrize("name", ["m.stl", "m.off", "m.ply"])
+@pytest.mark.parametrize("name", PROMISES)
 def test_a_header_that_promises_too_much_allocates_nothing(name: str) -> None:
     with pytest.raises((MeshError, LimitError)):
-        read_mesh(name, promise(name))
+        read_mesh(name, PROMISES[name])
 
 
 def test_accessors_beyond_their_buffer_and_cycles_are_refused() -> None:
@@ -233,9 +228,26 @@ def quantised(normalized: bool, extensions: dict[str, object] | None = None) -> 
     return glb_of(padded, faces.astype("<u2"), changes | (extensions or {}), normalized=normalized)
 
 
-@pytest.mark.parametrize("normalized", [False, True])
-def test_quantised_positions_of_a_glb_have_their_size(normalized: bool) -> None:
-    soup = read_mesh("m.glb", quantised(normalized))
+@pytest.mark.parametrize(
+    ("normalized", "change"),
+    [
+        *[(False, {}), (True, {})],
+        (False, {"extensions": {"ACME_notes": {}}, "nodes": [SCALED | {"extensions": {"ACME_notes": {}}}]}),
+        (False, {"nodes": [SCALED, {"mesh": 0}], "scenes": [{"nodes": [1]}, {"nodes": [0]}], "scene": 1}),
+        (False, {"nodes": [{"mesh": 0}, {"children": [0], "scale": [1e-4] * 3}], "scenes": []}),
+        (False, {"extensionsUsed": ["KHR_materials_variants"]}),
+    ],
+    ids=[
+        "whole",
+        "shares",
+        "an extension not required",
+        "the scene that is shown",
+        "no scenes: nodes above",
+        "variants",
+    ],
+)
+def test_quantised_positions_have_their_size_in_the_scene_that_is_shown(normalized: bool, change: Any) -> None:
+    soup = read_mesh("m.glb", quantised(normalized, change))
     # A step of the normalised ones is 3 micrometres.
     np.testing.assert_allclose(soup.vertices, box()[0], atol=2e-6)
 
@@ -257,21 +269,6 @@ def test_quantised_positions_of_a_glb_have_their_size(normalized: bool) -> None:
 def test_a_glb_that_would_be_read_wrongly_is_refused(change: dict[str, object], told: str) -> None:
     with pytest.raises(MeshError, match=told):
         read_mesh("m.glb", quantised(False, change))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"extensions": {"ACME_notes": {}}, "nodes": [SCALED | {"extensions": {"ACME_notes": {}}}]},
-        {"nodes": [SCALED, {"mesh": 0}], "scenes": [{"nodes": [1]}, {"nodes": [0]}], "scene": 1},
-        {"nodes": [{"mesh": 0}, {"children": [0], "scale": [1e-4] * 3}], "scenes": []},
-        {"extensionsUsed": ["KHR_materials_variants"]},
-    ],
-    ids=["an extension that is not required", "the scene that is shown", "no scenes: from the nodes above", "variants"],
-)
-def test_a_glb_is_read_as_its_scene_shows_it(change: dict[str, object]) -> None:
-    soup = read_mesh("m.glb", quantised(False, change))
-    np.testing.assert_allclose(soup.vertices, box()[0], atol=2e-6)
 
 
 @pytest.mark.parametrize("mode", [5, 6])

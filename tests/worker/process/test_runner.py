@@ -56,7 +56,7 @@ def raising(error: Exception):
     return stage
 
 
-def test_a_task_leaves_a_shard_and_a_manifest_that_describes_it(bench: Bench) -> None:
+def test_a_task_leaves_a_shard_with_its_manifest_and_is_not_done_again(bench: Bench) -> None:
     message = message_for()
     outcome = bench.run(message)
     assert (outcome.kind, outcome.output) == (EventKind.FINISHED, message.output)
@@ -68,11 +68,6 @@ def test_a_task_leaves_a_shard_and_a_manifest_that_describes_it(bench: Bench) ->
     assert [g.epsilon for g in manifest.grasps] == list(shard["quality/epsilon"][:, 1])
     assert all(g.stability_loss is None for g in manifest.grasps), "nan is no JSON number"
     assert shard.attributes["hand"] == "gripper"
-
-
-def test_a_task_that_was_done_before_is_not_done_again(bench: Bench) -> None:
-    message = message_for()
-    bench.run(message)
     assert bench.run(message, raising(AssertionError("it ran"))).kind is EventKind.FINISHED and bench.calls == 1
 
 

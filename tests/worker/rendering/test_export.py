@@ -61,7 +61,7 @@ def plane(path: Path, channel: str) -> np.ndarray:
         return np.array(file.channels()[channel].pixels)
 
 
-def test_colours_labels_depth_and_normals_come_back_exactly(views, tmp_path) -> None:
+def test_an_export_comes_back_exactly_with_its_cameras_and_is_not_repeated(views, tmp_path) -> None:
     export_images(views, tmp_path)
     for view in range(2):
         for file, column in (("rgb", "rgb"), ("semantic_segmentation", "segmentation")):
@@ -72,6 +72,15 @@ def test_colours_labels_depth_and_normals_come_back_exactly(views, tmp_path) -> 
         normals = np.stack([plane(tmp_path / f"normals_{view:04}.exr", axis) for axis in "XYZ"], axis=-1)
         assert normals.dtype == np.float16
         np.testing.assert_array_equal(normals, views["image/normals"][view])
+    left, right = (json.loads((tmp_path / f"view_{view:04}.json").read_text()) for view in range(2))
+    assert (left["eye"], right["eye"], right["scene"], left["width"], left["height"]) == ("left", "right", 1, W, H)
+    assert left["position"] == [0, 0, -0.5] and left["intrinsics"] == [[9, 0, 4], [0, 9, 3], [0, 0, 1]]
+    assert left["bounding_box_2d_tight"] == [1, 2, 3, 4] and left["occlusion_ratio"] == 0.25
+    assert right["bounding_box_2d_tight"] is None and right["occlusion_ratio"] is None
+    labels = json.loads((tmp_path / "labels.json").read_text())
+    assert [labels[k]["class"] for k in "0123"] == ["background", "table", "mug", "block"]
+    with pytest.raises(InputError, match="exported views already"):
+        export_images(views, tmp_path)
 
 
 def test_png_depth_is_right_to_half_a_step(views, tmp_path) -> None:
@@ -85,19 +94,6 @@ def test_png_depth_is_right_to_half_a_step(views, tmp_path) -> None:
     assert steps[0, 0] == 0
     assert pixels(tmp_path / "distance_to_image_plane_0001.png")[0, 0] == 65535
     assert not list(tmp_path.glob("distance*.exr"))
-
-
-def test_sidecar_tells_the_camera_and_a_second_export_is_refused(views, tmp_path):
-    export_images(views, tmp_path)
-    left, right = (json.loads((tmp_path / f"view_{view:04}.json").read_text()) for view in range(2))
-    assert (left["eye"], right["eye"], right["scene"], left["width"], left["height"]) == ("left", "right", 1, W, H)
-    assert left["position"] == [0, 0, -0.5] and left["intrinsics"] == [[9, 0, 4], [0, 9, 3], [0, 0, 1]]
-    assert left["bounding_box_2d_tight"] == [1, 2, 3, 4] and left["occlusion_ratio"] == 0.25
-    assert right["bounding_box_2d_tight"] is None and right["occlusion_ratio"] is None
-    labels = json.loads((tmp_path / "labels.json").read_text())
-    assert [labels[k]["class"] for k in "0123"] == ["background", "table", "mug", "block"]
-    with pytest.raises(InputError, match="exported views already"):
-        export_images(views, tmp_path)
 
 
 def test_points_of_a_rendered_object_lie_on_its_mesh(tmp_path: Path) -> None:
@@ -130,5 +126,4 @@ def test_surface_of_the_hand_of_a_shard_follows_its_kinematics() -> None:
     for row in range(2):
         np.testing.assert_allclose(found[row, palm], apply(pose[row], points.position[palm]), atol=1e-12)
     still = Shard("base", said, {**shard.arrays, "grasp/joint_positions": joints[[0, 0]]})
-    at_rest = hand_surface(still, np.array([1]))
-    assert np.abs(at_rest[0, ~palm] - found[1, ~palm]).max() > 0.01
+    assert np.abs(hand_surface(still, np.array([1]))[0, ~palm] - found[1, ~palm]).max() > 0.01

@@ -23,8 +23,7 @@ DOWN = np.concatenate([[0, 0, 0.25], quat_from_axis_angle(np.array([1.0, 0, 0]),
 
 
 def postures(rng: np.random.Generator, count: int) -> Posture:
-    quaternion = unit_vectors(rng, count, 4)
-    pose = np.concatenate([rng.uniform(-0.1, 0.3, (count, 3)), quaternion], 1)
+    pose = np.concatenate([rng.uniform(-0.1, 0.3, (count, 3)), unit_vectors(rng, count, 4)], 1)
     return Posture(pose, rng.uniform(-0.3, 1, (count, 2)))
 
 

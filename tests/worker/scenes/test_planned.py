@@ -120,7 +120,8 @@ def test_synth_in_a_scene_counts_lifts_as_evaluate_does(wish: str, beside: list[
     valid = shard["quality/valid"] == 1
     assert (shard["quality/success"][valid] == 1).all() and (shard["quality/clearance_m"][valid] >= MARGIN_M).all()
     assert valid.sum() == said["valid"] and (valid.all() or beside)
-    assert shard.attributes.get("neighbours", []) == beside and ("scene/neighbour_pose" in shard.arrays) == bool(beside)
+    assert shard.attributes.get("neighbours", []) == beside
+    assert not beside or shard["scene/neighbour_pose"].shape == (1, 1, 7)
     assert [one["object"] for one in json.loads(str(shard.attributes["scene"]))["neighbours"]] == beside
     told = graspd("evaluate --protocol lift", out)
     assert told["clear_share"] == (said["clear_share"] if beside else 1.0)
@@ -185,19 +186,6 @@ def planned_beside():
     spec = SceneSpec(kind="file", supports=(TABLE,), target=target, neighbours=beside)
     placed = scenes_of(spec, BLOCK, [post, wall], count=1, seed=0)[0].placed(np.zeros(8, int))
     return hand, BLOCK, placed, synthesize(hand, BLOCK, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
-
-
-def test_synth_with_neighbours_writes_them_lifts_judge_alike(tmp_path) -> None:
-    out = tmp_path / "g.h5"
-    table = "--scene table --with mug --scenes 1 -n 4 --want candidates --fidelity draft"
-    said = graspd(f"synth --hand barrett --object block {table} -o", out)
-    shard = read_shard(out, kind="base")
-    assert shard["scene/neighbour_pose"].shape == (1, 1, 7) and shard.attributes["neighbours"] == ["mug"]
-    assert json.loads(str(shard.attributes["scene"]))["neighbours"][0]["object"] == "mug"
-    told = graspd("evaluate --protocol lift", out)
-    assert told["clear_share"] == said["clear_share"]
-    held = {one["row"] for one in told["verdicts"] if one["held"] and one["clear"]}
-    assert held == set(np.flatnonzero(np.asarray(shard["quality/success"]) == 1).tolist())
 
 
 @pytest.mark.parametrize(

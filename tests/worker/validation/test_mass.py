@@ -64,12 +64,15 @@ def test_the_payload_of_a_pinch_is_what_its_friction_bears(friction: float) -> N
     assert 0.95 * bears(friction) < payload(friction) < bears(friction)
 
 
-def test_what_is_slippery_or_out_of_touch_bears_nothing_stop_all() -> None:
+def test_the_worst_direction_counts_and_what_is_out_of_touch_bears_nothing() -> None:
     assert np.isnan(payload(0.01))
     away = Posture(pinch().grasp.hand_pose - np.eye(7)[2], pinch().grasp.joint_positions)
     assert capacities(HAND, BOX, away, UP).tolist() == [0.0]
     at_stop = replace(HAND, lower=np.full(2, -heaviest.AT_STOP * 1e-3))
     assert not np.isfinite(capacities(at_stop, BOX, pinch().grasp, UP)).any()
+    # Along the line of the fingers one of them presses with all its effort, the other not at all.
+    along = np.array([[[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]])
+    assert capacities(HAND, BOX, pinch().grasp, along) == pytest.approx(TORQUE / LEVER_M / ACCELERATION, rel=0.01)
 
 
 @pytest.mark.parametrize("friction", [0.3, FRICTION, 1.0])
@@ -142,12 +145,6 @@ def test_a_job_counts_grasps_that_lift_the_wanted_payload(tmp_path, least, kept:
 def test_pinch_could_bear_what_pyramids_around_its_cones_bear(friction: float) -> None:
     found = capacities(HAND, BOX.with_mass(friction=friction), pinch().grasp, UP)
     assert found == pytest.approx(bears(friction) / math.cos(math.pi / EDGES), rel=2e-3)
-
-
-def test_of_several_directions_the_worst_counts() -> None:
-    # Along the line of the fingers one of them presses with all its effort, the other not at all.
-    along = np.array([[[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]])
-    assert capacities(HAND, BOX, pinch().grasp, along) == pytest.approx(TORQUE / LEVER_M / ACCELERATION, rel=0.01)
 
 
 def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:

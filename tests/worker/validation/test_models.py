@@ -123,7 +123,7 @@ def test_so_many_models_make_a_share(wanted: float, models: int, least: int) -> 
     assert needed_models(wanted, models) == least
 
 
-def test_a_grasp_meets_the_same_models_each_axis_once() -> None:
+def test_models_of_a_grasp_are_its_own_and_the_nominal_one_is_validated_alike() -> None:
     grasps = many_grasps()
     turned = grasps.take(np.arange(len(grasps))[::-1])
     assert models_of(PADS, grasps, 2, 8, 5) == models_of(PADS, turned, len(grasps) - 3, 8, 5)
@@ -132,6 +132,11 @@ def test_a_grasp_meets_the_same_models_each_axis_once() -> None:
     assert models_of(PADS, grasps, 2, 8, 5) not in others
     axes = [axis for axis, _ in models_of(PADS, grasps, 0, 8, 0)]
     assert sorted(axes) == sorted(axes_of(PADS)) and len(axes) == 8
+    verdicts = validate(PADS, BOX, grasps, pieces=WHOLE)
+    found = [models().standard(grasps, row, NOMINAL) for row in range(len(grasps))]
+    assert [rollout.success for rollout in found] == (verdicts.success == 1).tolist()
+    assert [rollout.margin for rollout in found] == verdicts.margin.tolist()
+    assert {True, False} == set((verdicts.success == 1).tolist())
 
 
 def test_it_stops_when_it_is_told_to() -> None:
@@ -216,15 +221,6 @@ def test_fits_that_change_nothing_are_not_offered() -> None:
     assert fits_of(ball) == frozenset()
     assert "hull" in fits_of(hand), "a finger has a shaft and a tip"
     assert len(refit_hand(hand, "hull").pieces) == 3 and refit_hand(ball, "capsule") is ball
-
-
-def test_nominal_variant_has_verdicts_of_the_judge_bit_for_bit() -> None:
-    grasps = many_grasps()
-    verdicts = validate(PADS, BOX, grasps, pieces=WHOLE)
-    found = [models().standard(grasps, row, NOMINAL) for row in range(len(grasps))]
-    assert [rollout.success for rollout in found] == (verdicts.success == 1).tolist()
-    assert [rollout.margin for rollout in found] == verdicts.margin.tolist()
-    assert {True, False} == set((verdicts.success == 1).tolist())
 
 
 def test_variants_reach_engine_and_leave_nominal_model_as_it_was() -> None:
@@ -401,6 +397,11 @@ def test_a_tendon_moves_the_sum_and_pulls_by_its_coefficients() -> None:
     q = hand.reduce(data.qpos[scene.joint_qpos])
     # Nothing else pulls: after 4 s what is left is below a thousandth of a radian. How the joints share it is open.
     assert q[bend] + 0.5 * q[curl] == pytest.approx(0.5 + 0.5 * 0.4, abs=1e-3)
+    separate = dataclasses.replace(hand, tendons=())
+    dragged = dataclasses.replace(separate, drag=Drag(np.zeros(hand.bodies), np.zeros(hand.bodies)))
+    keys = {verdict_key(one, BOX, "standard", False, pieces=WHOLE) for one in (hand, separate, dragged)}
+    assert len(keys) == 3
+    assert prefilter_key_terms(hand, "standard", ExecutionContext(prefilter="on")) == []
 
 
 def test_one_joint_of_tendon_takes_what_limit_of_other_leaves() -> None:
@@ -420,15 +421,6 @@ def test_one_joint_of_tendon_takes_what_limit_of_other_leaves() -> None:
     assert q[bend] == pytest.approx(0.5 + 0.5 * (0.8 - q[curl]), abs=1e-3)
 
 
-def test_the_first_judge_and_the_key_know_of_tendons() -> None:
-    hand = load(root="palm")
-    separate = dataclasses.replace(hand, tendons=())
-    dragged = dataclasses.replace(separate, drag=Drag(np.zeros(hand.bodies), np.zeros(hand.bodies)))
-    keys = {verdict_key(one, BOX, "standard", False, pieces=WHOLE) for one in (hand, separate, dragged)}
-    assert len(keys) == 3
-    assert prefilter_key_terms(load(root="palm"), "standard", ExecutionContext(prefilter="on")) == []
-
-
 def test_a_drive_stays_what_it_is_with_followers_or_on_a_tendon() -> None:
     text = CLAW.replace('joint="left_curl" coef="0.5"', 'joint="left_curl" coef="1"')
     tendon = load(text, root="palm")
@@ -442,12 +434,17 @@ def test_a_drive_stays_what_it_is_with_followers_or_on_a_tendon() -> None:
     assert 2 * cord.limit(back.effort) == pytest.approx(ratio.effort[dof])
 
 
-def test_the_same_model_gives_the_same_verdicts(tmp_path) -> None:
+def test_the_same_model_gives_the_same_verdicts_and_rows_add_up(tmp_path) -> None:
     row = evaluate(plates_case(), validation_hand=match_hands(PADS_HAND, PADS_HAND), cache=tmp_path)
     assert row["foreign_held"] == {"both": 2, "nominal": 0, "foreign": 0, "neither": 1}
     assert (row["agreement"], row["foreign_share"], row["fingertips_mm"]) == (1.0, 1.0, pytest.approx(0.0, abs=1e-6))
     assert [one["held_foreign"] for one in row["verdicts"]] == [True, True, False]
     json.dumps(row, allow_nan=False)
+    lost = {**row, "foreign_held": {"both": 0, "nominal": 1, "foreign": 1, "neither": 0}, "fingertips_mm": 0.4}
+    whole = combine([row, lost])
+    assert whole["foreign_held"] == {"both": 2, "nominal": 1, "foreign": 1, "neither": 1}
+    assert (whole["agreement"], whole["foreign_share"]) == (pytest.approx(3 / 5), pytest.approx(2 / 3, abs=1e-6))
+    assert whole["fingertips_mm"] == 0.4
 
 
 def test_a_model_with_other_pads_says_otherwise(tmp_path) -> None:
@@ -462,15 +459,6 @@ def test_a_model_with_other_pads_says_otherwise(tmp_path) -> None:
     assert evaluate(plates_case(), validation_hand=ours_in_theirs, cache=tmp_path)["foreign_share"] == 1.0
     theirs_in_ours = dataclasses.replace(same, theirs=with_their_shapes(same))
     assert evaluate(plates_case(), validation_hand=theirs_in_ours, cache=tmp_path)["foreign_share"] == 0.0
-
-
-def test_rows_add_up_by_their_grasps(tmp_path) -> None:
-    row = evaluate(plates_case(), validation_hand=match_hands(PADS_HAND, PADS_HAND), cache=tmp_path)
-    lost = {**row, "foreign_held": {"both": 0, "nominal": 1, "foreign": 1, "neither": 0}, "fingertips_mm": 0.4}
-    whole = combine([row, lost])
-    assert whole["foreign_held"] == {"both": 2, "nominal": 1, "foreign": 1, "neither": 1}
-    assert (whole["agreement"], whole["foreign_share"]) == (pytest.approx(3 / 5), pytest.approx(2 / 3, abs=1e-6))
-    assert whole["fingertips_mm"] == 0.4
 
 
 def test_joints_take_order_and_the_couplings_of_the_other_model() -> None:

@@ -41,11 +41,9 @@ def test_a_pressed_box_is_held_and_a_free_one_falls() -> None:
     verdict = validate(PADS, BOX, grasp_of(), level="dexgraspbench", pieces=WHOLE)
     assert verdict.reasons == ["held"] and verdict.success.tolist() == [1]
     assert (verdict.outcome == Outcome.HELD).all()
-    away = posture(((0, 0, -0.5), (0.0, 0.0)))
-    verdict = validate(PADS, BOX, grasp_of(contact=away), pieces=WHOLE)
+    verdict = validate(PADS, BOX, grasp_of(contact=posture(((0, 0, -0.5), (0.0, 0.0)))), pieces=WHOLE)
     assert verdict.reasons == ["displaced under +x"]
-    pressed = posture(((0, 0, 0), (0.068, 0.067)))
-    verdict = validate(PADS, BOX, grasp_of(contact=pressed), pieces=WHOLE)
+    verdict = validate(PADS, BOX, grasp_of(contact=posture(((0, 0, 0), (0.068, 0.067)))), pieces=WHOLE)
     assert verdict.penetration_depth_mm[0] == pytest.approx(3.0, abs=0.01)
 
 
@@ -240,8 +238,7 @@ def test_coupled_joints_stay_coupled_while_moving() -> None:
 
 
 def test_actuators_never_exceed_the_effort() -> None:
-    weak = replace(PADS, effort=np.array([2.0, 3.0]))
-    scene = build(weak, BOX, WHOLE, MujocoOptions())
+    scene = build(replace(PADS, effort=np.array([2.0, 3.0])), BOX, WHOLE, MujocoOptions())
     data = placed_data(scene, CONTACT.joint_positions[0], CONTACT.hand_pose[0])
     scene.command(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 0.08)
     mujoco.mj_step(scene.model, data, nstep=5)

@@ -43,7 +43,7 @@ def test_a_dataset_has_a_job_for_each_hand_and_object(either: Services) -> None:
     assert {(job.priority, job.request.scenes) for job in jobs} == {(Priority.BULK, 1)}
 
 
-def test_the_same_dataset_again_is_the_same_and_repeats_nothing(services: Services) -> None:
+def test_the_same_dataset_repeats_nothing_and_another_needs_another_name(services: Services) -> None:
     actions.create(services, wanted())
     plan_all(services)
     finish(services, jobs_of(services, "grasps")[0])
@@ -53,26 +53,21 @@ def test_the_same_dataset_again_is_the_same_and_repeats_nothing(services: Servic
     assert not new and again.states[State.SUCCEEDED] == 1
     assert services.queue.waiting() == queued
     assert len(services.index.jobs.page().items) == 4
+    with pytest.raises(errors.ConflictError, match=r"objects are ball, cube; its grasps is 32\); take another name"):
+        actions.create(services, wanted(objects=("ball",), grasps=64))
 
 
 def test_a_planner_that_was_stopped_is_continued(services: Services) -> None:
     actions.create(services, wanted())
     ticks = iter(range(100))
     assert DatasetRounds(services, clock=lambda: next(ticks)).advance(2.5)
-    planned = [cell.planned for cell in services.index.datasets.cells("grasps").items]
-    assert planned.count(True) == 2
+    assert [cell.planned for cell in services.index.datasets.cells("grasps").items].count(True) == 2
     plan_all(services)
     assert all(cell.planned for cell in services.index.datasets.cells("grasps").items)
     assert not DatasetRounds(services).advance(10)
 
 
-def test_a_name_stands_for_one_dataset(services: Services) -> None:
-    actions.create(services, wanted())
-    with pytest.raises(errors.ConflictError, match=r"objects are ball, cube; its grasps is 32\); take another name"):
-        actions.create(services, wanted(objects=("ball",), grasps=64))
-
-
-def test_a_dataset_of_an_older_graspd_is_the_same(services: Services) -> None:
+def test_records_of_an_older_graspd_are_read_and_are_the_same_dataset(services: Services) -> None:
     actions.create(services, wanted())
     old = json.loads(services.store.get(names.dataset_record_key("grasps")))
     del old["checksum"]
@@ -81,6 +76,10 @@ def test_a_dataset_of_an_older_graspd_is_the_same(services: Services) -> None:
     fresh.store.put(names.dataset_record_key("grasps"), json.dumps(old | {"digest": "0" * 32}).encode())
     dataset, new = actions.create(fresh, wanted())
     assert not new and dataset.digest == "0" * 32
+    stored = json.loads(services.store.get(names.dataset_record_key("grasps")))
+    stored["options"] = {k: v for k, v in stored["options"].items() if k not in ("options", "target")}
+    del stored["fidelities"]
+    assert DatasetRecord.model_validate(stored) == load_dataset(services.store, "grasps")
 
 
 def test_a_dataset_keeps_the_versions_it_was_created_with(services: Services) -> None:
@@ -297,13 +296,12 @@ def test_a_file_that_was_changed_is_fetched_again(source: Fetch, snapshot: Snaps
     assert hashlib.sha256(spoilt.read_bytes()).hexdigest() == snapshot.shards[0].sha256
 
 
-def test_a_wrong_checksum_leaves_no_file(snapshot: Snapshot, tmp_path: Path) -> None:
+def test_a_wrong_checksum_leaves_no_file_and_a_folder_must_be_possible(
+    snapshot: Snapshot, tmp_path: Path, source: Fetch
+) -> None:
     with pytest.raises(errors.DamagedShard, match=snapshot.shards[0].id):
         export_shards(snapshot, tmp_path / "out", lambda shard: [b"something else"])
     assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == []
-
-
-def test_a_folder_that_cannot_be_made_is_the_callers_mistake(source: Fetch, snapshot: Snapshot, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(errors.InputError, match="cannot be made"):
         export_shards(snapshot, tmp_path / "file" / "out", source)
@@ -368,29 +366,17 @@ def test_a_later_chart_changes_nothing_of_a_dataset(services: Services) -> None:
     assert actions.create(services, wanted(**AUTO))[1] is False
 
 
-def test_a_target_out_of_reach_on_one_cell_makes_no_dataset(services: Services) -> None:
+def test_auto_costs_what_it_chooses_and_needs_a_target_within_reach(services: Services) -> None:
     publish_record(services.store, "charts", chart())
     with pytest.raises(errors.InputError, match=r"no fidelity of fast_graspd meets gsr>=0\.75"):
         actions.create(services, wanted(**AUTO | {"target": "gsr>=0.75"}))
     assert not services.store.exists(names.dataset_record_key("grasps"))
-
-
-def test_the_cost_of_auto_is_that_of_the_chosen_fidelities(services: Services) -> None:
-    publish_record(services.store, "charts", chart())
     both = estimate(services.index, wanted(hands=("gripper",), **AUTO), Resolver(services.store))
     apart = [
         estimate(services.index, wanted(hands=("gripper",), objects=(obj,), fidelity=fidelity))
         for obj, fidelity in (("ball", "standard"), ("cube", "draft"))
     ]
     assert both.seconds == pytest.approx(sum(one.seconds for one in apart))
-
-
-def test_a_record_from_before_has_neither_and_is_read(services: Services) -> None:
-    actions.create(services, wanted())
-    stored = json.loads(services.store.get(names.dataset_record_key("grasps")))
-    stored["options"] = {k: v for k, v in stored["options"].items() if k not in ("options", "target")}
-    del stored["fidelities"]
-    assert DatasetRecord.model_validate(stored) == load_dataset(services.store, "grasps")
 
 
 def test_each_cell_in_scenes_says_how_its_fidelity_was_chosen(either: Services) -> None:

@@ -73,16 +73,14 @@ def test_a_policy_that_evicts_is_bad_once_memory_is_bounded(redis_settings: Sett
     assert not found.ok and "allkeys-lru" in found.message and "maxmemory-policy noeviction" in found.fix
 
 
-def test_a_full_memory_is_bad(redis_settings: Settings, client: Redis) -> None:
-    client.config_set("maxmemory", str(client.info("memory")["used_memory"]))
-    found = check_redis(redis_settings)
-    assert not found.ok and "MiB are used" in found.message
-
-
-def test_a_replica_is_bad(redis_settings: Settings, client: Redis) -> None:
+def test_a_replica_and_a_full_memory_are_bad(redis_settings: Settings, client: Redis) -> None:
     client.replicaof("127.0.0.1", str(free_ports(1)[0]))
     found = check_redis(redis_settings)
     assert not found.ok and "primary" in found.fix
+    client.replicaof("NO", "ONE")
+    client.config_set("maxmemory", str(client.info("memory")["used_memory"]))
+    found = check_redis(redis_settings)
+    assert not found.ok and "MiB are used" in found.message
 
 
 def test_a_redis_that_returns_another_value_is_bad(redis_settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
