@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 
 from graspd.service.model.contact_region import parse_region
 from graspd.service.model.errors import InputError
 from graspd.studies.stability.gradients import run_kernel
 from graspd.worker.hands.digits import Part
 from graspd.worker.objects.region import ContactRegion
-from graspd.worker.simulation.data import HandState
+from graspd.worker.simulation.data import HandState, allocate_contacts
+from graspd.worker.simulation.kernels import projection
 from graspd.worker.simulation.model import ANYWHERE, NEAR_GAP, NO_CONTACT_M, AllowedContacts, LossOptions
 from graspd.worker.simulation.projection import Projection, ProjectionOptions
 from graspd.worker.simulation.record import record_evaluation
@@ -114,6 +116,19 @@ def test_the_projection_moves_an_excluded_finger_out_to_the_clearance() -> None:
         assert depth[0] < 2e-4
     assert np.abs(least[False]).max() < 2e-3, "both fingers touch"
     assert least[True] == pytest.approx([NO_CONTACT_M, 0.0], abs=2e-3) and least[True][0] > NO_CONTACT_M - 2e-4
+
+
+def test_the_projection_holds_no_point_that_must_not_touch() -> None:
+    model, data = rig(HAND, BOX, capacity=1)
+    step, contacts = Projection(model, data, ProjectionOptions()), allocate_contacts(1, 2)
+    data.set_state(state())
+    for name, values in {"body": [1, 2], "distance": [1e-3] * 2, "weight": [-1.0, 1.0]}.items():
+        getattr(contacts, name).assign(np.array([values], np.float32 if name != "body" else np.int32))
+    contacts.count.fill_(2)
+    step.residuals.count.zero_()
+    inputs = [2, data.hands, contacts, step.options.near, step.options.target, 2e-3, 5e-4, 0.02]
+    wp.launch(projection.point_residuals, (1, 1), inputs=inputs, outputs=[step.residuals], device="cpu")
+    assert step.residuals.body.numpy()[0, : step.residuals.count.numpy()[0]].tolist() == [2]
 
 
 def test_solvers_without_limits_on_contacts_refuse_them() -> None:
