@@ -220,7 +220,8 @@ class HandMapping:
 
 
 def mapping_of(file: Path) -> HandMapping | None:
-    """Load the mapping of a grasp file's experiment; None if there is none. Raises InputError: it is invalid."""
+    """Load the mapping of a grasp file's experiment; None if there is none.
+    Raises InputError: the mapping is invalid."""
     for above in file.resolve().parents:
         if above.name in _FOLDERS:
             return _read(above.parent / FILE)

@@ -101,8 +101,9 @@ def check_table(placed: PlacedGrasps) -> None:
 
 
 def tabletop_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats) -> Row:
-    """Return the fields for hands on arms of a grasp whose object is at `pose` (7,); the evaluator ignores them.
-    `approach_qpos` (W, 7 + J) is the open hand from standoff to pregrasp, `lift_qpos` (7 + J,) the raised squeeze."""
+    """Return a grasp's fields for hands on arms; the evaluator ignores them.
+    The object is at `pose` (7,). `approach_qpos` (W, 7 + J) is the open hand from standoff to pregrasp, `lift_qpos`
+    (7 + J,) the raised squeeze."""
     assert grasps.approach is not None and grasps.coming is not None and grasps.lift is not None
     way = compose(pose, grasps.approach[row])
     raised = compose(pose, grasps.lift.hand_pose[row])
@@ -145,7 +146,8 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
 def with_trajectory(
     hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> GraspSet:
-    """Add approach and lift (object frame) if all approaches have the same number of waypoints and fixed joints."""
+    """Add approach and lift in the object's frame, if all rows have suitable ones.
+    All approaches must have the same number of waypoints, and fixed joints."""
     if not all({"approach_qpos", "lift_qpos"} <= set(row) for row in rows):
         return grasps
     ways = [np.asarray(row["approach_qpos"], float) for row in rows]

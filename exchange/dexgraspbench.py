@@ -69,9 +69,9 @@ def write(
     folder: Path,
     placed: PlacedGrasps | None = None,
 ) -> list[Path]:
-    """Write grasps and all files that DexGraspBench's evaluator needs; return the first experiment's grasp files.
-    The object is at the origin or, for `placed` grasps, on its table. Each of `write_models` gets an experiment. Raises
-    InputError: the scenes are no tables."""
+    """Write grasps and all files that DexGraspBench's evaluator needs.
+    Return the grasp files of the first experiment. The object is at the origin or, for `placed` grasps, on its table.
+    Each of `write_models` gets an experiment. Raises InputError: the scenes are no tables."""
     if placed is not None:
         check_table(placed)
     name = plain_name(obj.name)

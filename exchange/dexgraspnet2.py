@@ -91,9 +91,10 @@ class SceneGraspness:
     def of_view(
         self, depth: Floats, labels: NDArray[np.uint8], intrinsics: Floats, camera: Floats, object_pose: Floats
     ) -> NDArray[np.float32]:
-        """Return the graspness (N, 1) of a picture's points, as the loader makes and orders them; 0 on neighbours.
-        `depth` (H, W) [m] is 0 without a surface. `labels` (H, W) are 0 for background and 1 for the grasps' object; at
-        least one is not 0. `intrinsics` are (3, 3) [px]. `camera` (4, 4) and `object_pose` (7,): table's frame."""
+        """Return the graspness (N, 1) of a picture's points, as the loader makes and orders them.
+        It is 0 on neighbours. `depth` (H, W) [m] is 0 without a surface. `labels` (H, W) are 0 for background and 1 for
+        the grasps' object; at least one is not 0. `intrinsics` are (3, 3) [px]. `camera` (4, 4) and `object_pose` (7,):
+        table's frame."""
         cloud = back_project(depth, intrinsics)
         inside = workspace_mask(cloud, depth, labels, camera)
         found = np.zeros(np.count_nonzero(inside), np.float32)
@@ -106,9 +107,9 @@ class SceneGraspness:
 
 
 def lines_of_sight(hand: HandModel, grasps: Posture) -> tuple[Floats, Floats]:
-    """Return origins (K, 3) [m] and unit directions (K, 3) of the lines from palm to middle of thumb and fingers.
-    The thumb is the fingertip farthest from the other fingertips of the open hand. With one fingertip, or fingers that
-    meet in the palm, the line is the approach."""
+    """Return origins (K, 3) [m] and unit directions (K, 3) of the grasps' lines of sight.
+    A line leads from the palm to the middle of thumb and fingers. The thumb is the fingertip farthest from the other
+    fingertips of the open hand. With one fingertip, or fingers that meet in the palm, the line is the approach."""
     palm = apply(grasps.hand_pose, hand.palm.centre)
     line = quat_rotate(grasps.hand_pose[:, 3:], hand.palm.approach)
     if len(hand.fingertips) < 2:
@@ -161,8 +162,9 @@ def back_project(depth: Floats, intrinsics: Floats) -> Floats:
 
 
 def workspace_mask(cloud: Floats, depth: Floats, labels: NDArray[np.uint8], camera: Floats) -> NDArray[np.bool_]:
-    """Return a mask (H, W) of pixels whose points (H, W, 3) the loader keeps: near the box around labelled points.
-    The box is in the table's frame. As in the loader, labelled pixels without depth extend it to the camera."""
+    """Return a mask (H, W) of the pixels whose points (H, W, 3) the loader keeps.
+    They have a depth and are near the box around the labelled points. The box is in the table's frame. As in the
+    loader, labelled pixels without depth extend it to the camera."""
     whole = np.concatenate([cloud.reshape(-1, 3), np.ones((depth.size, 1))], axis=1)
     there = np.einsum("ab,nb->na", camera, whole)[:, :3]
     objects = there[labels.reshape(-1) > 0]
@@ -193,7 +195,8 @@ _MEMBERS: Final = 1024  # largest number of arrays in an `.npz` file
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: Noise = None
 ) -> ExportSummary:
-    """Write each scene with pictures and grasps. Raises InputError: there is none, or too many for the format."""
+    """Write each scene with its pictures and grasps.
+    Raises InputError: the folder has data already, there is no scene, or there are too many for the format."""
     top = folder / "data"
     if top.exists():
         raise InputError(f"{top} exists already; give another folder as --output")

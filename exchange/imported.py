@@ -123,7 +123,8 @@ class _Reader(pickle.Unpickler):
 
 
 def load_npy(path: Path) -> Any:
-    """Load a `.npy` file: an array, or its only object. Raises InputError: it is invalid, or would run code."""
+    """Load a `.npy` file: an array, or its only object.
+    Raises InputError: the file is invalid, or would run code."""
     try:
         with path.open("rb") as file:
             try:

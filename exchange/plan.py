@@ -44,8 +44,9 @@ class ExportPart:
 
 
 def held_out_objects(kinds: Mapping[str, str], share: float) -> frozenset[str]:
-    """Return the objects of a share of the families; `kinds` has each object's family, and a hash selects families.
-    At least one family is held out and at least one is not; a single family is not held out."""
+    """Return the objects of a share of the families, which a hash selects.
+    `kinds` has the family of each object. At least one family is held out and at least one is not; a single family is
+    not held out."""
     order = sorted(set(kinds.values()), key=lambda kind: hashlib.sha256(kind.encode()).digest())
     chosen = order[: min(max(1, round(share * len(order))), len(order) - 1)]
     return frozenset(name for name, kind in kinds.items() if kind in chosen)

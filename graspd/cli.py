@@ -1,4 +1,6 @@
-"""Root of the command line; it lists the commands of all packages, and imports a module on its first use."""
+"""Root of the command line, with a list of the commands of all packages.
+
+A module is imported on its first use."""
 
 from __future__ import annotations
 

@@ -59,7 +59,8 @@ def frame_of(grasps: Grasps) -> Any:
 
 
 def html_of(grasps: Grasps) -> str:
-    """Return `repr` and a picture of the best grasps as HTML, or a table of their metrics without a picture."""
+    """Return `repr` and a picture of the best grasps as HTML.
+    A table of their metrics replaces a picture that is missing or too large."""
     head = f"<p>{escape(repr(grasps))}</p>"
     try:
         png = sheet_of(grasps, PICTURED, EDGE, PICTURE_S)

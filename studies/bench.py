@@ -1,4 +1,6 @@
-"""Planner throughput by fidelity, batch and threads, with times of kernels and of the host: table, JSON, plot."""
+"""Planner throughput by fidelity, batch and threads, with times of kernels and of the host.
+
+Results are a table, JSON and a plot."""
 
 from __future__ import annotations
 
@@ -127,7 +129,8 @@ SAMPLED: Final = 12  # number of iterations that are timed launch by launch, in 
 
 
 def kernel_shares(pair: Pair, fidelity: Fidelity, count: int) -> dict[str, Any]:
-    """Return time per iteration [ms], shares of kernels and queries per second of each phase, for `count` grasps."""
+    """Return time per iteration [ms], shares of kernels and queries per second of each phase.
+    They are measured with `count` grasps."""
     state = sample_starts(pair.model(pair.coarse), seed=0, batch=0, indices=range(count), each=1)
     phases: dict[str, Any] = {}
     for name, side, schedule in (
@@ -190,7 +193,8 @@ def _timed(
 
 
 def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
-    """Return host time per candidate [ms]: time of one CPU thread outside the planner's kernels, with full caches."""
+    """Return host time per candidate [ms], with full caches.
+    It is the time of one CPU thread outside the planner's kernels."""
     run = ExecutionContext("cpu", threads=1)
     plan(hand, obj, PlanRequest(count, fidelity, seed=1), run)
     with kernel_seconds() as elsewhere:
@@ -206,7 +210,8 @@ def device_name(device: str) -> str:
 
 
 def clock_of(device: str) -> Callable[[], float]:
-    """Return a clock: core-seconds of all threads on a CPU, where other load hardly matters; wall clock on a GPU."""
+    """Return a clock: core-seconds of all threads on a CPU, wall clock on a GPU.
+    Other load hardly matters for core-seconds."""
     return time.process_time if device == "cpu" else time.perf_counter
 
 

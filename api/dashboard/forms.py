@@ -1,4 +1,6 @@
-"""Form of a job without JavaScript, with its estimated cost; submission, cancellation and retry of jobs."""
+"""Form of a job without JavaScript, and submission, cancellation and retry of jobs.
+
+The form has the estimated cost of the job."""
 
 from __future__ import annotations
 

@@ -208,7 +208,8 @@ def _point(runs: list[Run], axis: str, scale: float, names: list[str]) -> Point 
 
 
 def _speed(runs: Sequence[Run]) -> float:
-    """Return the number of grasps per second of total time; in charts of graspd 0.1, the geometric mean speed."""
+    """Return the number of grasps per second of total time.
+    In charts of graspd 0.1, it is the geometric mean speed."""
     if all(run.found is not None for run in runs) and (seconds := sum(run.seconds for run in runs)):
         return sum(run.found or 0 for run in runs) / seconds
     speeds = [run.valid_per_second for run in runs if run.valid_per_second]

@@ -67,7 +67,8 @@ def object_to_pieces(
     # Data out:
     near_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Take samples of the object within `margin` into account, which include its edges. Launch over (B, P)."""
+    """Include the object's samples within `margin` in the least distances. Launch over (B, P).
+    The samples include the object's edges."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return
@@ -98,7 +99,8 @@ def bodies_to_pieces(
     # Data out:
     pair_inout: wp.array3d(dtype=wp.float32),
 ):
-    """Compute the least distance of each body's points to bodies that must not touch it. Launch over (B, P)."""
+    """Compute the least distance between bodies that must not touch. Launch over (B, P).
+    The distance is that of one body's points from the other's pieces."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return
@@ -150,9 +152,9 @@ def close(
     stopped_inout: wp.array2d(dtype=wp.int32),
     q_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Stop dofs that move a touching body; close the others by a step that skips no contact. Launch over B.
-    A point of body a moves by at most the sum of lever[d, a] |dq_d| over the closing dofs d. All dofs of a finger have
-    the same step, share * gap / sum lever (conservative advancement)."""
+    """Stop dofs that move a touching body; close the others by one step. Launch over B.
+    The step skips no contact. A point of body a moves by at most the sum of lever[d, a] |dq_d| over the closing dofs d.
+    All dofs of a finger have the same step, share * gap / sum lever (conservative advancement)."""
     b = wp.tid()
     if active_inout[b] == 0:
         return

@@ -275,7 +275,8 @@ def accept(
     contact_inout: wp.array2d(dtype=wp.int32),
     taken_inout: wp.array(dtype=wp.int32),
 ):
-    """Accept or reject the proposals; the first has no rival, as the old energy is infinite. Launch over B."""
+    """Accept or reject the proposals. Launch over B.
+    The first proposal has no rival, because the old energy is infinite."""
     b = wp.tid()
     rng = rng_inout[b]
     uniform = wp.randf(rng)

@@ -84,7 +84,8 @@ Generators = list[np.random.Generator]
 
 @dataclass(frozen=True)
 class Seeds:
-    """A `WarmStart` from a network's proposals; starts of fast_graspd replace those without a free proposal."""
+    """A `WarmStart` from a network's proposals.
+    Starts of fast_graspd replace those without a free proposal."""
 
     network: ProposalNetwork
     starts: int  # starts per grasp
@@ -145,8 +146,8 @@ def table_height(supports: Sequence[Obstacle]) -> float:
 def _clear(
     model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: PlacedGrasps
 ) -> tuple[HandState, Floats]:
-    """Return for each of n starts the free hand that retreats least, and its depth [m], inf if none is free.
-    Hands without clearance from obstacles are first moved up."""
+    """Return for each of n starts the free hand that retreats least, and its depth [m].
+    The depth is inf if no hand is free. Hands without clearance from obstacles are first moved up."""
     count, probe = len(scene), Probe(model, len(scene), room=ROOM)
     draws = len(drawn.pivot) // count
     near = (np.linalg.norm(drawn.pivot, axis=1) < model.obj.model.radius + FAR_M).reshape(count, draws)
@@ -218,7 +219,8 @@ class SurfaceView:
         return np.asarray(self._middle(pose) + distance * toward)
 
     def cloud(self, pose: Floats, camera: Floats, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Sample (count, 3) points [m] and normals among pixels' nearest points, with the object at `pose` (7,)."""
+        """Sample points (count, 3) [m] and normals among the nearest points of a camera's pixels.
+        The object is at `pose` (7,)."""
         points, normals = quat_rotate(pose[3:], self.points) + pose[:3], quat_rotate(pose[3:], self.normals)
         rays = points - camera
         facing = np.flatnonzero((normals * rays).sum(axis=1) < 0)

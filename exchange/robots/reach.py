@@ -288,7 +288,8 @@ class ArmScene:
         self.hand_qpos = _addresses(self.model, hand, "hand")
 
     def touches(self, arm_joints: Floats, hand_joints: Floats, object_pose: Floats) -> str:
-        """Return a colliding pair at arm dofs (A,), hand joints (J,) and object pose (7,); empty if there is none."""
+        """Return a colliding pair, or an empty text if there is none.
+        The posture is given by arm dofs (A,), hand joints (J,) and object pose (7,)."""
         self._put(self.model, self.data, arm_joints, hand_joints)
         self.data.mocap_pos[0], self.data.mocap_quat[0] = object_pose[:3], object_pose[3:]
         mujoco.mj_kinematics(self.model, self.data)

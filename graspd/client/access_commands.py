@@ -55,7 +55,7 @@ def add_key(
 @keys_app.command("rotate", epilog="graspd keys rotate alice --grace 24h")
 def rotate_key(
     name: NameArgument,
-    grace: Annotated[str, typer.Option(help="Time for which the old secret remains valid: 24h, 7d.")] = "0s",
+    grace: Annotated[str, typer.Option(help="Time for which the old secret remains valid: 24h, 7d; 0s: none.")] = "0s",
     expires: LifetimeOption = None,
     json: JsonFlag = False,
 ) -> None:

@@ -99,7 +99,8 @@ def evaluate_command(
 
 
 def _validate_level(protocol: str, level: str) -> str:
-    """Return the level, or the protocol's default if empty; raise InputError if protocol or level is unknown."""
+    """Return the level, or the default of the protocol if `level` is empty.
+    Raises InputError: the protocol or the level is unknown."""
     if protocol not in get_args(Protocol):
         raise InputError(f"unknown protocol {protocol!r}; choose {choices_text(protocol, get_args(Protocol))}")
     levels = get_args(LiftLevel if protocol == "lift" else Level)

@@ -178,7 +178,9 @@ def chart(
     batch: Annotated[str, typer.Option(help="Grasps per call: one or several numbers, separated by commas.")] = "32",
     baseline_batch: Annotated[int, typer.Option(min=1, help="Grasps per call of methods with a budget of steps.")] = 8,
     repeats: Annotated[int, typer.Option(min=1, help="Timed calls per setting, hand and object.")] = 2,
-    option: Annotated[list[str] | None, typer.Option(help="Option of a method: graspit:steps=40000.")] = None,
+    option: Annotated[
+        list[str] | None, typer.Option(help="Option of a method, METHOD:NAME=VALUE: graspit:steps=40000; repeatable.")
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Small run: seconds instead of an hour.")] = False,
     sweep: Annotated[bool, typer.Option("--sweep", help="Vary the settings of fast_graspd, one at a time.")] = False,
     knob: Annotated[list[str] | None, typer.Option(help="With --sweep: only this setting; repeatable.")] = None,
@@ -186,7 +188,9 @@ def chart(
     device: Annotated[str, typer.Option(help="Device: cpu, cuda:0 or auto.")] = "auto",
     out: Annotated[Path | None, typer.Option(help="Folder for chart.json, .csv, .md, .png and .svg.")] = None,
     remark: Annotated[str, typer.Option(help="Note on the conditions, for the report.")] = "",
-    scene: Annotated[str, typer.Option(help="free, table, bin, shelf or a file.")] = "free",
+    scene: Annotated[
+        str, typer.Option(help="free, table, bin, shelf or a file; free grasps transferred to it are compared.")
+    ] = "free",
     work: Annotated[Path | None, typer.Option(help="With --scene: folder in which a stopped run continues.")] = None,
     source: Annotated[Path | None, typer.Option("--from", help="Use a chart.json instead of measuring.")] = None,
     publish: Annotated[bool, typer.Option("--publish", help="Publish to the store, for `fidelity: auto`.")] = False,

@@ -113,7 +113,8 @@ def _qualities(card: Row, tally: Tally) -> Any:
 
 
 def _directions(card: Row, tally: Tally) -> Any:
-    """Plot directions of palms: in the object's frame (top row) and by elevation over the table (bottom row)."""
+    """Plot directions of palms in the object's frame, and by elevation over the table.
+    The top row has the former, the bottom row the latter."""
     hands = [hand for hand in _names(card, "hands") if card["directions"]["by_hand"][hand]][:_PANELS]
     if not hands:
         return None

@@ -117,9 +117,10 @@ def settings_of(
     quick: bool,
     run: ExecutionContext,
 ) -> list[Setting]:
-    """Return a setting for each fidelity and batch of each method, and one for a method without fidelities.
-    The latter has `batches[0]` grasps per call, or `baseline_batch` if it has an option `steps`, because such grasps
-    take seconds each. Raises InputError: a method or an option is unknown."""
+    """Return a setting for each fidelity and batch of each method.
+    A method without fidelities has one setting. It has `batches[0]` grasps per call by default, or `baseline_batch` if
+    the method has an option `steps`, because such grasps take seconds each. Raises InputError: a method or an option is
+    unknown."""
     variants = [_variant(text) for text in methods]
     given = _options_of(options, [name for name, _, _ in variants])
     found: list[Setting] = []

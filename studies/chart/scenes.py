@@ -198,8 +198,8 @@ class ValidatedGrasps:
 
 
 def lift_figures(rows: Sequence[Mapping[str, Any]]) -> Row:
-    """Return shares of all candidates with 95 % intervals (Wilson), lifted grasps per second, and robust share.
-    All grasps have equal weight; refused cells have no time."""
+    """Return shares of all candidates, lifted grasps per second, and robust share.
+    Shares have 95 % intervals (Wilson). All grasps have equal weight; refused cells have no time."""
     grasps = sum(row["grasps"] for row in rows)
     found: Row = {"grasps": grasps}
     for name in SHARES:

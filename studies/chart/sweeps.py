@@ -98,8 +98,8 @@ def sweep(
     knobs: Sequence[str],
     say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
-    """Return a row per setting (`knob`) and value, with its `speedup` over the default and a run's figures.
-    Values are interleaved, repeat by repeat. Times are those of `clock_of`."""
+    """Return a row per setting (`knob`) and value, with its `speedup` over the default.
+    A row also has the figures of a run. Values are interleaved, repeat by repeat. Times are those of `clock_of`."""
     wp.load_module(module=kernels, device=run.device)
     default = KnobValue("", "default")
     true = thing.load(TRUE_ERROR_M)

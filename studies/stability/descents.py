@@ -1,4 +1,6 @@
-"""Stress tests of the planner's descent: displaced starts, extreme rates and weights, 100,000 iterations."""
+"""Stress tests of the planner's descent.
+
+They use displaced starts, extreme rates and weights, and up to 100,000 iterations."""
 
 from __future__ import annotations
 

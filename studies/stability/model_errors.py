@@ -103,7 +103,8 @@ ERRORS: Final[dict[str, _Error]] = {
 def model_error_map(
     hands: Sequence[HandModel], obj: ObjectModel, options: MapOptions, *, errors: Sequence[str] = (), every: int
 ) -> StabilityMap:
-    """Map the share of valid grasps that hold despite one of `errors` (default: all), each n-th (`every`) amount."""
+    """Map the share of valid grasps that hold despite an error of the model.
+    `errors` are names of errors (default: all); each `every`-th amount is tested."""
     cells = [cell for hand in hands for cell in _cells(hand, obj, options, errors or tuple(ERRORS), every)]
     return StabilityMap(
         "model_errors",

@@ -1,4 +1,6 @@
-"""Difficult scenes: flat and tall objects on a table, walls and neighbours, too small or large objects."""
+"""Difficult scenes of boxes.
+
+They are flat and tall boxes on a table, boxes among walls and neighbours, and too small or large boxes."""
 
 from __future__ import annotations
 
