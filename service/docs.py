@@ -81,8 +81,15 @@ def keywords_stub() -> str:
     ]
     job, python = keywords_of(JobOptions, "job"), keywords_of(LocalOptions, "python")
     for title, keywords in (("JobKeywords", job), ("SynthesizeKeywords", python)):
-        parts += ["", f"class {title}(TypedDict, total=False):", *(f"    {row.name}: {text}" for row, text in keywords)]
+        parts += ["", f"class {title}(TypedDict, total=False):", *(_keyword(row.name, text) for row, text in keywords)]
     return "\n".join(parts) + "\n"
+
+
+def _keyword(name: str, text: str) -> str:
+    """Return a line of a stub; the values of a long Literal each have their own line."""
+    line = f"    {name}: {text}"
+    inner = text.removeprefix("Literal[").removesuffix("]").replace(", ", ",\n        ")
+    return line if len(line) <= 120 else f"    {name}: Literal[\n        {inner},\n    ]"
 
 
 PARTS: Final[dict[str, Callable[[], str]]] = {

@@ -67,7 +67,7 @@ def balance(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random selection within a kind.")] = 0,
     json: JsonFlag = False,
 ) -> None:
-    """Write a subset of a dataset in which no kind of valid grasps is more frequent than others."""
+    """Write a subset of a dataset with no kind of valid grasps more frequent, or the most different ones."""
     by = ("" if spread else "type,direction") if by is None else by
     kinds = [one.strip() for one in by.split(",") if one.strip()]
     chooser = Balance(kinds, at_most, min_distance, seed, hand, spread)

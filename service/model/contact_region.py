@@ -29,7 +29,8 @@ def parse_region(text: str) -> list[Plane]:
 
 
 def parse_pose(text: str) -> tuple[float, ...]:
-    """Parse `x, y, z, qw, qx, qy, qz` [m]; raise ValueError for another form, or a norm other than 1 within 1e-3."""
+    """Parse `x, y, z, qw, qx, qy, qz` [m].
+    Raises ValueError: another form, or a quaternion whose norm differs from 1 by more than 1e-3."""
     parts = [part.strip() for part in text.split(",")]
     if len(parts) == 7 and all(re.fullmatch(_NUMBER, part) for part in parts):
         pose = tuple(map(float, parts))

@@ -1,4 +1,4 @@
-"""Subsets of datasets, balanced over grasp types, approach directions or resting faces, or most different."""
+"""Subsets of datasets: balanced over types, approach directions or resting faces, or most different."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Balance:
             raise InputError(f"choose categories to balance: {', '.join(KINDS)}")
 
     def __call__(self, shards: list[Shard]) -> list[NDArray[np.bool_]]:
-        """Return masks of selected grasps: valid, limited per category, drawn at random by the seed or most different.
+        """Return masks of selected grasps: valid, limited per category, random or most different.
         The seed also draws the first of the most different grasps.
         Raises InputError: a shard lacks the category."""
         kinds = self._kinds(shards)

@@ -1,4 +1,4 @@
-"""Requirements on the grasps of a job: type, digits, contact region, approach direction and wrist pose.
+"""Requirements on the grasps of a job: type, digits, contact region, approach and wrist pose.
 
 Requirements act on all steps of planning: starts, contacts of the optimisation, and selection of candidates."""
 
@@ -104,7 +104,8 @@ class Requirements:
         return max(2, self.rule.digits if self.rule else 0)
 
     def check(self, hand: HandModel, obj: ObjectModel) -> None:
-        """Raise InputError if the hand has too few digits or does not reach, or the object no surface in the region."""
+        """Raise InputError if the hand cannot fulfil the requirements on this object.
+        It has too few digits or does not reach the object, or the object has no surface in the region."""
         rule, names = self.rule, digit_names(hand)
         if rule is not None and rule.digits > len(names):
             count = f"has {len(names)}" if names else "is a gripper"
@@ -215,7 +216,7 @@ class Requirements:
         return out
 
     def like_columns(self, grasp: Posture) -> dict[str, Floats]:
-        """Return the distance [m] and the angle [deg] (N,) of wrists from the demonstrated pose; empty without one."""
+        """Return distances [m] and angles [deg] (N,) of wrists from the demonstrated pose; empty without one."""
         if self.like is None:
             return {}
         distance = np.linalg.norm(grasp.hand_pose[:, :3] - self.like[:3], axis=1)
@@ -234,7 +235,7 @@ def count_bits(numbers: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _reach_m(hand: HandModel) -> float:
-    """Return the largest distance of the hand's surface from its wrist in its pre-shape and at its limits [m]."""
+    """Return the hand's largest extent from its wrist in its pre-shape and at its limits [m]."""
     q = np.array([hand.preshape, hand.lower, hand.upper])
     grasp = Posture(np.tile(IDENTITY_POSE, (3, 1)), hand.expand(q))
     return float(np.linalg.norm(surface_points(hand, grasp), axis=2).max())

@@ -135,8 +135,8 @@ def draw_starts(pair: _Pair, generators: list[np.random.Generator]) -> tuple[Han
 
 
 def draw_at_pose(hand: HandModel, centre: Floats, pose: Floats, noise: Floats) -> tuple[HandState, Floats]:
-    """Return hands around a wrist pose (7,), from normal random numbers (n, 6 + D), and their approaches (n, 3).
-    `centre` (3,) is the object's centre of mass."""
+    """Return hands around a wrist pose (7,), and their approaches (n, 3).
+    The random numbers `noise` (n, 6 + D) are normal; `centre` (3,) is the object's centre of mass."""
     turn = LIKE_NOISE[1] * noise[:, 3:6]
     angle = np.linalg.norm(turn, axis=1)
     rotation = quat_multiply(quat_from_axis_angle(turn / np.maximum(angle, 1e-12)[:, None], angle), pose[3:])
