@@ -51,6 +51,7 @@ class JobKeywords(TypedDict, total=False):
     touch_region: str
     avoid_region: str
     approach_cone: str
+    like: str
     friction: float
     density: float | None
     object_friction: float | None
@@ -106,6 +107,7 @@ class SynthesizeKeywords(TypedDict, total=False):
     touch_region: str
     avoid_region: str
     approach_cone: str
+    like: str | Path
     friction: float
     density: float | None
     object_friction: float | None

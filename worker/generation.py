@@ -49,14 +49,16 @@ from graspd.worker.validation.validator import prefilter_grasps, validate
 
 #: Reasons to reject a grasp. diverged: its numbers are not finite. blocked: an obstacle of its scene is in the way.
 #: dropped: the validator did not hold it. gate: it fails the geometric gate. not_robust: it holds in too few models.
-#: requirements: it fails a requirement on type, digits, region or approach. weak: its payload is too small. alike: it
-#: is a near-duplicate of a selected grasp.
+#: requirements: it fails one of the job's requirements. weak: its payload is too small. alike: it is a near-duplicate
+#: of a selected grasp.
 REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "requirements", "not_robust", "weak", "alike")
+#: Outcomes of failed requirements.
+_FAILED: Final = ("other_type", "other_digits", "other_approach", "outside_region", "other_wrist_pose")
 #: Rejections whose names differ from the outcome's; failed pushes and lifts of the validator are `dropped`.
 _REJECTION_OF: Final = {
     "no_place": "blocked",
     **{f"gate_{name}": "gate" for name in GATES},
-    **dict.fromkeys(("other_type", "other_digits", "other_approach", "outside_region"), "requirements"),
+    **dict.fromkeys(_FAILED, "requirements"),
 }
 #: Names of the outcomes of failed pushes and of failed lifts.
 _PUSHED: Final = {
@@ -243,6 +245,7 @@ class Scoring(AbstractContextManager["Scoring"]):
             friction = self.request.friction
             measured = run.part(*PARTS[1:])
             columns |= measure(self.hand, self.obj, grasps, friction=friction, region=required.region, run=measured)
+            columns |= required.like_columns(grasps.grasp)
         columns["quality/feasible"] = passes_gate(columns)
         feasible = columns["quality/feasible"] == 1
         held = columns.get("quality/success", np.zeros(len(rows), np.int8)) == 1

@@ -50,19 +50,29 @@ def where(
 def balance(
     source: SourceArgument,
     out: OutOption,
-    by: Annotated[str, typer.Option(help=f"Kinds, separated by commas: {', '.join(KINDS)}.")] = "type,direction",
+    by: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Kinds, separated by commas: {', '.join(KINDS)}; default: type,direction; none with --spread."
+        ),
+    ] = None,
     at_most: Annotated[int, typer.Option(min=0, help="Maximum per kind and cell; 0: the median over kinds.")] = 0,
     min_distance: Annotated[
         float, typer.Option(min=0, max=0.1, help="Minimum distance between grasps of a cell [m]; 0: any.")
     ] = 0.0,
+    spread: Annotated[
+        int, typer.Option(min=0, help="Number of most different grasps per hand and object, and per kind of --by.")
+    ] = 0,
     hand: Annotated[str | None, typer.Option(help="Hand file for distances; default: found by its digest.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random selection within a kind.")] = 0,
     json: JsonFlag = False,
 ) -> None:
-    """Write a subset of a dataset in which no kind of valid grasps is more frequent than others."""
+    """Write a subset of a dataset with no kind of valid grasps more frequent, or the most different ones."""
+    by = ("" if spread else "type,direction") if by is None else by
     kinds = [one.strip() for one in by.split(",") if one.strip()]
-    chooser = Balance(kinds, at_most, min_distance, seed, hand)
+    chooser = Balance(kinds, at_most, min_distance, seed, hand, spread)
     said = {"balance": kinds, "from": source, "at_most": at_most, "min_distance": min_distance, "seed": seed}
+    said |= {"spread": spread} if spread else {}
     _report(write_subset(shards_of(source), chooser, out, said=said), out, json=json)
 
 

@@ -1,4 +1,4 @@
-"""Regions of an object as half-spaces, parts or colours, and cones of approach directions, as text."""
+"""Regions of an object, cones of approach directions and wrist poses, as text."""
 
 from __future__ import annotations
 
@@ -61,6 +61,18 @@ def parse_region(text: str) -> RegionSpec:
         x, y, z = (sign if k == axis else 0.0 for k in range(3))
         planes.append((x, y, z, sign * float(match[3])))
     return RegionSpec(tuple(planes))
+
+
+def parse_pose(text: str) -> tuple[float, ...]:
+    """Parse `x, y, z, qw, qx, qy, qz` [m].
+    Raises ValueError: another form, or a quaternion whose norm differs from 1 by more than 1e-3."""
+    parts = [part.strip() for part in text.split(",")]
+    if len(parts) == 7 and all(re.fullmatch(_NUMBER, part) for part in parts):
+        pose = tuple(map(float, parts))
+        if abs(math.hypot(*pose[3:]) - 1.0) <= 1e-3:
+            return pose
+        raise ValueError(f"the quaternion qw, qx, qy, qz of a wrist pose has norm 1; got {math.hypot(*pose[3:]):.4g}")
+    raise ValueError(f"a wrist pose is x, y, z, qw, qx, qy, qz in metres, such as 0, 0, 0.1, 1, 0, 0, 0; got {text!r}")
 
 
 def parse_cone(text: str) -> tuple[tuple[float, float, float], float]:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self, get_args
 from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
 from graspd.service.model.base import DIGEST, Digest, Model, Name
-from graspd.service.model.contact_region import parse_cone, parse_region
+from graspd.service.model.contact_region import parse_cone, parse_pose, parse_region
 from graspd.service.model.fidelity import AUTO, OFFERED, Fidelity, resolve_fidelity
 from graspd.service.model.grasp_types import GraspTypeName
 from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG, Density, Friction, Mass
@@ -66,10 +66,11 @@ SHAKE_NEEDS_A_SCENE: Final = "shake needs a lift out of a scene: choose a scene,
 
 
 #: Options that state requirements on grasps.
-REQUIREMENTS: Final = ("type", "digits", "touch_region", "avoid_region", "approach_cone")
+REQUIREMENTS: Final = ("type", "digits", "touch_region", "avoid_region", "approach_cone", "like")
 DigitName = Literal["thumb", "index", "middle", "ring", "little", "sixth"]
 Region = Annotated[str, Field(max_length=200), AfterValidator(lambda text: text and parse_region(text) and text)]
 Cone = Annotated[str, Field(max_length=80), AfterValidator(lambda text: text and parse_cone(text) and text)]
+WristPose = Annotated[str, Field(max_length=160), AfterValidator(lambda text: text and parse_pose(text) and text)]
 
 
 def _sparse(default: Any, **facts: Any) -> Any:
@@ -179,6 +180,11 @@ class JobOptions(Model):
         "",
         description="cone of the palm's approach: axis and largest angle [deg], such as 0, 0, -1, 30. The axis is in "
         "the frame of the scene, or of a free object",
+    )
+    like: Annotated[WristPose, Option(schema=7)] = _sparse(
+        "",
+        description="demonstrated wrist pose x, y, z, qw, qx, qy, qz in the object's frame [m]. Grasps start around it "
+        "and stay within 4 cm and 30 degrees",
     )
     friction: Annotated[float, Option(), Form("grasps", "Friction coefficient", "Coulomb, for the metrics")] = Field(
         1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics"
@@ -344,7 +350,7 @@ class JobOptions(Model):
 
     @property
     def requirements(self) -> dict[str, Any]:
-        """Requirements on type, digits, region and approach, without those that are not given."""
+        """Requirements on type, digits, region, approach and wrist pose, without those that are not given."""
         given = {name: getattr(self, name) for name in REQUIREMENTS}
         return {name: value for name, value in given.items() if value not in ("any", "", ())}
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from graspd.service.model.contact_region import parse_pose
 from graspd.service.model.domain import SCENES, JobOptions
 from graspd.service.model.errors import choices_text
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
@@ -17,6 +18,8 @@ from graspd.service.model.scene_spec import MOST_NEIGHBOURS, MOST_SCENES, SceneS
 
 _LOCAL: Final[tuple[Place, ...]] = ("synth", "python")
 _COMMAND: Final[tuple[Place, ...]] = ("synth",)
+#: Grasp file, and optionally the row of a grasp.
+GRASP_FILE: Final = re.compile(r"(.+\.(?:h5|hdf5))(?::(\d+))?")
 #: Scene fields of a job; local commands use a `SceneSpec` instead.
 _OF_PLACE: Final = {"scene", "faces", "neighbours", "touch", "scenes"}
 
@@ -42,6 +45,11 @@ class LocalOptions(MeshOptions, JobOptions):
         description="clearance of fingertips to supports [mm]; default: that of the scene file, else 0. 2: as for "
         "the rest of the hand; 0: contact allowed; negative: fingertips may press into the support",
     )
+    like: Annotated[str | Path, Option(places=_LOCAL)] = Field(  # type: ignore[assignment]
+        "",
+        description="demonstrated wrist pose x, y, z, qw, qx, qy, qz in the object's frame [m], or a grasp file of the "
+        "same hand: grasps.h5 (first valid grasp) or grasps.h5:ROW. Grasps stay within 4 cm and 30 degrees",
+    )
     payload: Annotated[bool, Option("advanced", _LOCAL, "--payload/--no-payload")] = Field(
         False,
         description="measure the payload of each valid grasp; default of graspd synth in scenes with a given mass",
@@ -63,6 +71,13 @@ class LocalOptions(MeshOptions, JobOptions):
         if not isinstance(value, str) or value not in FIDELITIES:
             raise ValueError(f"unknown fidelity {value!r}; choose one of {choices_text(str(value), FIDELITIES)}")
         return value
+
+    @field_validator("like")
+    @classmethod
+    def _check_like(cls, value: str | Path) -> str:
+        if (text := str(value)) and not GRASP_FILE.fullmatch(text):
+            parse_pose(text)
+        return text
 
     @field_validator("join", mode="before")
     @classmethod
@@ -93,8 +108,9 @@ class LocalOptions(MeshOptions, JobOptions):
         given = self.model_fields_set & MeshOptions.model_fields.keys()
         return {name: value for name in sorted(given) if (value := getattr(self, name))}
 
-    def request(self, options: dict[str, Any]) -> JobOptions:
-        """Return job options without scene and rechecks; `options` has digests of files. Raise InputError."""
+    def request(self, options: dict[str, Any], like: str = "") -> JobOptions:
+        """Return job options without scene and rechecks; `options` has digests of files, `like` a pose.
+        Raise InputError."""
         shared = {name: getattr(self, name) for name in JobOptions.model_fields.keys() - _OF_PLACE}
         # Rechecks sample many jobs; a single file can be validated completely at level `dexgraspbench`.
-        return validate(JobOptions, shared | {"fidelity": self.knobs, "options": options, "rechecks": 0})
+        return validate(JobOptions, shared | {"fidelity": self.knobs, "options": options, "rechecks": 0, "like": like})

@@ -247,6 +247,7 @@ OUTCOMES: Final = {
     "other_digits": "with other digits in contact",
     "other_approach": "outside the approach cone",
     "outside_region": "with contact outside the region",
+    "other_wrist_pose": "far from the demonstrated wrist pose",
     "not_robust": "held in too few perturbed models",
     "weak": "below the required payload",
     "alike": "near-duplicates",

@@ -1,4 +1,4 @@
-"""Subsets of datasets, balanced over grasp types, approach directions or resting faces."""
+"""Subsets of datasets: balanced over types, approach directions or resting faces, or most different."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from graspd.service.store import validity
 from graspd.service.store.shards import Shard
 from graspd.worker.files.provenance import hand_of_shard
 from graspd.worker.grasps import Posture
-from graspd.worker.quality.diversity import distinct_mask, hand_points
+from graspd.worker.quality.diversity import distinct_mask, hand_points, select_farthest
 
 #: Categories over which grasps can be balanced.
 KINDS: Final = ("type", "direction", "face")
@@ -33,33 +33,40 @@ class Balance:
     min_distance: float = 0.0  # least distance of two selected grasps [m], see `worker.quality.diversity`; 0 for any
     seed: int = 0
     hand: str | None = None  # the hand's file if the shards do not lead to it; only distances need it
+    spread: int = 0  # number of most different grasps per category, instead of `at_most` random ones; 0 for none
 
     def __post_init__(self) -> None:
         if unknown := [one for one in self.by if one not in KINDS]:
             choices = choices_text(unknown[0], KINDS)
             raise InputError(f"grasps cannot be balanced by {unknown[0]!r}; choose from {choices}")
-        if not self.by:
+        if self.spread and self.at_most:
+            raise InputError("spread and at_most exclude each other: both limit the grasps per kind")
+        if not self.by and not self.spread:
             raise InputError(f"choose categories to balance: {', '.join(KINDS)}")
 
     def __call__(self, shards: list[Shard]) -> list[NDArray[np.bool_]]:
-        """Return masks of selected grasps: valid, drawn at random by the seed, limited per category.
+        """Return masks of selected grasps: valid, limited per category, random or most different.
+        The seed also draws the first of the most different grasps.
         Raises InputError: a shard lacks the category."""
         kinds = self._kinds(shards)
         wanted = np.concatenate([validity.valid_mask(shard.arrays) for shard in shards])
         if self.min_distance > 0 and wanted.any():
-            wanted[np.flatnonzero(wanted)[~self._distinct(shards, wanted)]] = False
+            wanted[np.flatnonzero(wanted)[~distinct_mask(self._points(shards, wanted), self.min_distance)]] = False
         _, kind = np.unique(kinds, axis=0, return_inverse=True)
         counts = np.bincount(kind.ravel()[wanted])
         limit = self.at_most or int(np.median(counts[counts > 0])) if wanted.any() else 0
+        points = self._points(shards, wanted) if self.spread and wanted.any() else np.zeros(0)
         order = np.random.default_rng(self.seed).permutation(len(kinds))
         chosen = np.zeros(len(kinds), bool)
         for number in range(len(counts)):
             mine = order[(kind.ravel()[order] == number) & wanted[order]]
-            chosen[mine[:limit]] = True
+            if self.spread and len(mine):
+                mine = mine[select_farthest(points[np.searchsorted(np.flatnonzero(wanted), mine)], self.spread)]
+            chosen[mine[: self.spread or limit]] = True
         return np.split(chosen, np.cumsum([len(shard["quality/valid"]) for shard in shards])[:-1])
 
     def _kinds(self, shards: list[Shard]) -> NDArray[np.int64]:
-        columns = []
+        columns = [np.zeros(sum(len(shard["quality/valid"]) for shard in shards), np.int64)]
         for name in self.by:
             if name == "face":
                 columns.append(face_numbers(np.concatenate([_down_directions(shard) for shard in shards])))
@@ -69,12 +76,12 @@ class Balance:
             columns.append(np.concatenate([np.asarray(shard[_COLUMNS[name]], np.int64) for shard in shards]))
         return np.stack(columns, axis=1)
 
-    def _distinct(self, shards: list[Shard], wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _points(self, shards: list[Shard], wanted: NDArray[np.bool_]) -> NDArray[np.float64]:
         hand = hand_of_shard(shards[0], self.hand)
         parts = [Posture.from_columns(shard.arrays) for shard in shards]
         pose = np.concatenate([part.hand_pose for part in parts])[wanted]
         joints = np.concatenate([part.joint_positions for part in parts])[wanted]
-        return distinct_mask(hand_points(hand, Posture(pose, joints)), self.min_distance)
+        return hand_points(hand, Posture(pose, joints))
 
 
 def _down_directions(shard: Shard) -> NDArray[np.float64]:

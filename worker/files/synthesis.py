@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -13,14 +14,15 @@ from numpy.typing import NDArray
 
 from graspd.service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOptions
 from graspd.service.model.errors import InputError
-from graspd.service.model.local_options import LocalOptions
+from graspd.service.model.local_options import GRASP_FILE, LocalOptions
 from graspd.service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
 from graspd.service.model.planning import explain_shortfall, sum_outcomes
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import Floats
+from graspd.service.store import validity
 from graspd.service.store.columns import Attribute
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
-from graspd.service.store.shards import json_attribute
+from graspd.service.store.shards import json_attribute, read_shard
 from graspd.worker.batched_generation import validated_batches
 from graspd.worker.engines.batch_sizes import batches_at_once, processes_at_once
 from graspd.worker.engines.devices import Device
@@ -171,7 +173,7 @@ def synthesize_with(hand: str, obj: str, options: LocalOptions, **run: Any) -> S
     return synthesize_grasps(
         hand,
         obj,
-        options.request(local_options(options.method, options.options)),
+        options.request(local_options(options.method, options.options), wrist_pose(str(options.like))),
         place=options.place,
         scenes=options.scenes,
         mesh=options.mesh,
@@ -180,6 +182,20 @@ def synthesize_with(hand: str, obj: str, options: LocalOptions, **run: Any) -> S
         join=None if options.join == "auto" else options.join,
         **run,
     )
+
+
+def wrist_pose(like: str) -> str:
+    """Return option `like` as seven numbers; a grasp file without a row stands for its first valid grasp.
+    Raises InputError: no such row, or no valid grasp."""
+    if (found := GRASP_FILE.fullmatch(like)) is None:
+        return like
+    shard = read_shard(Path(found[1]), kind="base")
+    rows = np.arange(len(shard["quality/valid"]))
+    if found[2] is not None and int(found[2]) >= len(rows):
+        raise InputError(f"{found[1]} has {len(rows)} grasps, numbered from 0: row {found[2]} does not exist")
+    if not len(rows := rows[[int(found[2])]] if found[2] else rows[validity.valid_mask(shard.arrays)]):
+        raise InputError(f"{found[1]} has no valid grasp: choose a row, such as {found[1]}:0")
+    return ", ".join(f"{value:.7g}" for value in np.asarray(shard["grasp/hand_pose"], float)[rows[0]])
 
 
 def synthesize_grasps(

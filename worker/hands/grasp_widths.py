@@ -51,7 +51,7 @@ GOOD_M: Final = 0.006
 #: Largest distance by which the cube extends beyond its contacts towards the palm [m].
 BEYOND_M: Final = 0.012
 #: Number of surface points in the search for two given parts, and range of their gaps [m].
-PART_POINTS: Final = 5000
+PART_POINTS: Final = 2000
 THINNEST_M: Final = 0.003
 PART_WIDTH_M: Final = 0.07
 #: Number of pairs per posture that are evaluated in detail, and number of postures evaluated at once.

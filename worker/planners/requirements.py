@@ -1,4 +1,4 @@
-"""Requirements on the grasps of a job: type, digits, contact region and approach direction.
+"""Requirements on the grasps of a job: type, digits, contact region, approach and wrist pose.
 
 Requirements act on all steps of planning: starts, contacts of the optimisation, and selection of candidates."""
 
@@ -11,12 +11,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.contact_region import parse_cone, parse_region
+from graspd.service.model.contact_region import parse_cone, parse_pose, parse_region
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.grasp_types import BALANCED, TAXONOMY
 from graspd.service.model.metrics import GraspType
-from graspd.service.model.transforms import Floats, quat_conjugate, quat_rotate
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_conjugate, quat_rotate
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.digits import NAMES, Part, digit_names, digit_order, finger_of_body, hand_with_digits
 from graspd.worker.hands.model import HandModel
@@ -25,6 +25,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.parts import Voxels, voxels_of
 from graspd.worker.objects.region import WHOLE, ContactRegion
 from graspd.worker.planners.fitting import region_points
+from graspd.worker.quality.diversity import hand_points as surface_points
 from graspd.worker.quality.grasp_type import RULES, Rule, pattern_of
 from graspd.worker.quality.probe import probe_of
 from graspd.worker.simulation.environment import PlacedGrasps
@@ -34,6 +35,10 @@ from graspd.worker.simulation.model import ANYWHERE, AllowedContacts
 INNER: Final = 0.6
 #: Least share of the contact area in the required region.
 LEAST_SHARE: Final = 0.95
+#: Largest distance [m] and angle [deg] of a wrist from the demonstrated pose. They include .92 (Allegro) and .83
+#: (Shadow) of the candidates that start around the pose of a valid grasp of a mug.
+LIKE_M: Final = 0.04
+LIKE_DEG: Final = 30.0
 #: Largest angle between a direction and the nearest free direction that is tested [rad].
 _SPACING: Final = 0.16
 #: Number of hand points that decide the type of a candidate, and reach of their distances [m].
@@ -51,6 +56,8 @@ class Requirements:
     """(3,) axis of the cone of palm approaches; scene frame in scenes, else object frame. None: any approach."""
     cone: float = np.pi
     """Largest angle between a palm's approach and `approach` [rad]."""
+    like: Floats | None = None
+    """(7,) demonstrated wrist pose, object frame; None: any pose."""
 
     @classmethod
     def of(
@@ -79,11 +86,16 @@ class Requirements:
         if request.approach_cone:
             axis, degrees = parse_cone(request.approach_cone)
             found = replace(found, approach=np.array(axis) / np.linalg.norm(axis), cone=float(np.deg2rad(degrees)))
+        if request.like:
+            pose = np.array(parse_pose(request.like))
+            place, turn = pose[:3] - np.asarray(origin), pose[3:] / np.linalg.norm(pose[3:])
+            found = replace(found, like=np.concatenate([place, turn]))
         return found if found.is_set else NOTHING
 
     @property
     def is_set(self) -> bool:
-        return self.type != "any" or bool(self.digits) or not self.region.is_whole or self.approach is not None
+        pose = self.approach is not None or self.like is not None
+        return self.type != "any" or bool(self.digits) or not self.region.is_whole or pose
 
     @property
     def rule(self) -> Rule | None:
@@ -100,8 +112,9 @@ class Requirements:
         return max(2, self.rule.digits if self.rule else 0)
 
     def check(self, hand: HandModel, obj: ObjectModel) -> None:
-        """Raise InputError: the hand has too few digits, the object no surface in the region.
-        Raises HandError: the digits do not oppose."""
+        """Raise InputError if the hand cannot fulfil the requirements on this object.
+        It has too few digits or does not reach the object, or the object has no surface in the region. Raises
+        HandError: the digits do not oppose."""
         rule, names = self.rule, digit_names(hand)
         if rule is not None and rule.digits > len(names):
             count = f"has {len(names)}" if names else "is a gripper"
@@ -112,6 +125,13 @@ class Requirements:
             given = ", ".join(self.digits)
             raise InputError(f"type {self.type} needs {rule.digits} digits with the thumb; digits name {given}")
         require_opposing(self.hand(hand))
+        if self.like is not None:
+            away = float(np.linalg.norm(self.like[:3] - obj.centre_of_mass)) - obj.radius
+            if away > _reach_m(hand) + LIKE_M:
+                raise InputError(
+                    f"{hand.name} does not reach {obj.name} from the demonstrated wrist pose: give it in metres in the "
+                    "object's frame"
+                )
         if not self.region.is_whole:
             region_points(obj, self.region)
 
@@ -174,8 +194,8 @@ class Requirements:
     def fulfilled(
         self, hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps | None
     ) -> NDArray[np.bool_]:
-        """Return a mask (N,) of grasps of the whole hand with the required type and approach."""
-        out = np.ones(len(grasp), bool)
+        """Return a mask (N,) of grasps of the whole hand with the required type, approach and wrist pose."""
+        out = self._is_like(grasp)
         if (axes := self.axes(placed, len(grasp))) is not None:
             out &= _cosine(hand, grasp, axes) >= np.cos(self.cone)
         if self.rule is not None:
@@ -205,7 +225,22 @@ class Requirements:
             elif self.rule.digits:
                 right &= (mask & 1 == 1) & (count_bits(mask) == self.rule.digits)
             out[~right] = "other_type"
+        out[~self._is_like(grasp)] = "other_wrist_pose"
         return out
+
+    def like_columns(self, grasp: Posture) -> dict[str, Floats]:
+        """Return distances [m] and angles [deg] (N,) of wrists from the demonstrated pose; empty without one."""
+        if self.like is None:
+            return {}
+        distance = np.linalg.norm(grasp.hand_pose[:, :3] - self.like[:3], axis=1)
+        angle = 2 * np.arccos(np.clip(np.abs(grasp.hand_pose[:, 3:] @ self.like[3:]), 0.0, 1.0))
+        return {"quality/like_distance_m": distance, "quality/like_angle_deg": np.rad2deg(angle)}
+
+    def _is_like(self, grasp: Posture) -> NDArray[np.bool_]:
+        if self.like is None:
+            return np.ones(len(grasp), bool)
+        distance, angle = self.like_columns(grasp).values()
+        return (distance <= LIKE_M) & (angle <= LIKE_DEG)
 
 
 def _region(text: str, obj: ObjectModel | None, origin: Floats) -> Floats | Voxels:
@@ -222,6 +257,13 @@ def _region(text: str, obj: ObjectModel | None, origin: Floats) -> Floats | Voxe
 
 def count_bits(numbers: NDArray[np.intp]) -> NDArray[np.intp]:
     return (numbers[:, None] >> np.arange(8) & 1).sum(axis=1)
+
+
+def _reach_m(hand: HandModel) -> float:
+    """Return the hand's largest extent from its wrist in its pre-shape and at its limits [m]."""
+    q = np.array([hand.preshape, hand.lower, hand.upper])
+    grasp = Posture(np.tile(IDENTITY_POSE, (3, 1)), hand.expand(q))
+    return float(np.linalg.norm(surface_points(hand, grasp), axis=2).max())
 
 
 def _cosine(hand: HandModel, grasp: Posture, axes: Floats) -> Floats:

@@ -81,6 +81,17 @@ def distinct_mask(points: Floats, least: float, *, given: int = 0) -> NDArray[np
     return kept
 
 
+def select_farthest(points: Floats, count: int) -> NDArray[np.intp]:
+    """Return rows (`count`,) of N grasps, by points (N, P, 3); all N rows if there are fewer.
+    The first row is 0; each other grasp is the farthest from its nearest selected one, at equal distance the first."""
+    rows, least = list[int](), np.full(len(points), np.inf)
+    for _ in range(min(count, len(points))):
+        rows.append(int(least.argmax()))
+        least = np.minimum(least, distances(points, np.full(len(points), rows[-1]), np.arange(len(points))))
+        least[rows] = -1.0
+    return np.array(rows, np.intp)
+
+
 def _rotation_vector(quaternion: Floats) -> Floats:
     q = np.where(quaternion[:, :1] < 0, -quaternion, quaternion)
     sine = np.linalg.norm(q[:, 1:], axis=1)

@@ -15,8 +15,9 @@ from graspd.service.readers.clouds import OF_GRASPS
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.files.curation import Balance, face_numbers
 from graspd.worker.files.subsets import select_grasps
+from graspd.worker.quality.diversity import select_farthest
 from tests.service.readers import box_scenes
-from tests.worker.models import quality_columns
+from tests.worker.models import quality_columns, two_finger_hand
 
 COUNT = 40
 
@@ -89,6 +90,42 @@ def test_no_kind_is_more_frequent_than_the_median_one(folder: Path, tmp_path: Pa
     run("balance", folder, "--by", "type", "-o", again)
     for one, other in zip(kept, sorted(again.rglob("*.h5")), strict=True):
         assert np.array_equal(one["grasp/hand_pose"], read_shard(other)["grasp/hand_pose"])
+
+
+def test_the_farthest_grasp_is_selected_next() -> None:
+    line = np.zeros((5, 7, 3))
+    line[..., 0] = np.array([2.0, 0, 10, 6, 7])[:, None]
+    for count in range(7):
+        assert select_farthest(line, count).tolist() == [0, 2, 3, 1, 4][:count]
+    assert len(select_farthest(line[:0], 3)) == 0
+
+
+def test_spread_grasps_are_more_different_than_random_ones(folder: Path, tmp_path: Path, monkeypatch) -> None:
+    hand = two_finger_hand()
+    monkeypatch.setattr("graspd.worker.files.curation.hand_of_shard", lambda shard, given: hand)
+    for name, more in (("few", []), ("again", []), ("other", ["--seed", "5"]), ("types", ["--by", "type"])):
+        assert run("balance", folder, "--spread", "6", "-o", tmp_path / name, *more).exit_code == 0
+    poses = {}
+    for name in ("few", "again", "other", "types"):
+        found = Grasps(open_shards(tmp_path / name).only(objects=["mug"])).arrays(
+            "grasp/hand_pose", "quality/grasp_type"
+        )
+        poses[name] = found["grasp/hand_pose"]
+    assert len(poses["few"]) == 6 and np.array_equal(poses["few"], poses["again"])
+    assert not np.array_equal(poses["few"], poses["other"]), "the seed draws the first grasp"
+    assert np.bincount(found["quality/grasp_type"]).tolist() == [0, 6, 6], "six of each type"
+    every = np.asarray(Grasps(open_shards(folder).only(objects=["mug"])).arrays("grasp/hand_pose")["grasp/hand_pose"])
+    rng = np.random.default_rng(0)
+    drawn = np.mean([mean_least(every[rng.choice(len(every), 6, replace=False)]) for _ in range(20)])
+    assert mean_least(poses["few"]) > 1.3 * drawn
+    assert json.loads((tmp_path / "few" / "subset.json").read_text())["spread"] == 6
+    both = run("balance", folder, "--spread", "6", "--at-most", "3", "-o", tmp_path / "both")
+    assert both.exit_code == 2 and "exclude each other" in both.stderr
+
+
+def mean_least(pose: np.ndarray) -> float:
+    apart = np.linalg.norm(pose[:, None, :3] - pose[None, :, :3], axis=2)
+    return float((apart + 9 * np.eye(len(pose))).min(axis=1).mean())
 
 
 def test_faces_are_told_by_what_lies_below() -> None:

@@ -314,9 +314,9 @@ def _rows_with_starts(launch: _Launch, begun: _Starts) -> Rows:
     for owner in sorted(set(owners.tolist())):
         own = deep[owners == owner]
         if batches.placed is None and own.max() > NO_PLACE:
-            batches.fail(owner, starts.no_start_error(launch.coarse))
+            batches.fail(owner, starts.no_start_error(launch.coarse, batches.requirements))
         elif batches.placed is not None and own.min() > NO_PLACE and not batches.asked[owner].wanted.others_have_place:
-            batches.fail(owner, scene_starts.no_start_error(launch.coarse))
+            batches.fail(owner, scene_starts.no_start_error(launch.coarse, batches.requirements))
     return batches.active_rows()
 
 

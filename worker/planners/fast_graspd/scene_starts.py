@@ -41,13 +41,14 @@ from graspd.worker.planners.fast_graspd.starts import (
     POSTURE_NOISE,
     TILT,
     Probe,
+    draw_at_pose,
     frames_about,
     hands_at_distances,
     store_states,
 )
 from graspd.worker.planners.fitting import region_points, surface_of
 from graspd.worker.planners.port import NoStartFound
-from graspd.worker.planners.requirements import NOTHING, Requirements
+from graspd.worker.planners.requirements import LIKE_M, NOTHING, Requirements
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment, PlacedGrasps
 from graspd.worker.simulation.model import Model
@@ -96,8 +97,13 @@ def free_directions(scene: Environment, obj: ObjectModel) -> Floats:
     return np.asarray(ways[free])
 
 
-def no_start_error(model: Model) -> NoStartFound:
+def no_start_error(model: Model, wanted: Requirements = NOTHING) -> NoStartFound:
     hand, obj = model.hand.model, model.obj.model
+    if wanted.like is not None:
+        return NoStartFound(
+            f"{hand.name} finds no free place at the demonstrated wrist pose: {obj.name} or obstacles of its scenes "
+            "are in the way"
+        )
     return NoStartFound(
         f"{hand.name} finds no free place around {obj.name} in this scene: the object is too large, or its "
         "surroundings leave no room"
@@ -121,12 +127,12 @@ def clear_scene_starts(
     probe = Probe(model, len(generators), room=ROOM)
     used = set(placed.index.tolist())
     openings = {s: Openings.in_scene(hand, obj, scene, wanted) for s, scene in enumerate(placed.scenes) if s in used}
-    scene = np.repeat(placed.index, each)
+    scene, at_pose = np.repeat(placed.index, each), wanted.like is not None
     reaching = (np.arange(len(scene)) % each % EVERY < REACHING) | wanted.by_pads
-    reaching &= np.array([len(openings[s].sums) > 0 for s in scene.tolist()], bool)
+    reaching &= np.array([not at_pose and len(openings[s].sums) > 0 for s in scene.tolist()], bool)
     count, around = len(scene), _SceneDraws(hand, obj, ways, openings, wanted)
     uniform = np.array([g.random((DRAWS, _UNIFORM)) for g in generators])
-    normal = np.zeros((count, 0, 2 + hand.dofs))
+    normal = np.zeros((count, 0, (6 if at_pose else 2) + hand.dofs))
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
     depth, beside = np.full(count, np.inf), np.where(reaching, np.inf, 0.0)
     order, least_beside = around.select_draws(uniform, scene, reaching, placed)
@@ -139,13 +145,14 @@ def clear_scene_starts(
             break
         if number == normal.shape[1]:
             # Most starts need few draws, so random numbers of later draws are generated on demand.
-            normal = np.concatenate([normal, _normal(generators, rows, hand.dofs)], axis=1)
+            normal = np.concatenate([normal, _normal(generators, rows, normal.shape[2])], axis=1)
         reach = reaching[rows] & (number < REACHES)
         numbers = np.where(reach, order[rows, min(number, REACHES - 1)], number)
         states, across_pairs = around.hands_of_draws(uniform[rows, numbers], normal[rows, number], scene[rows], reach)
         off = _raise_draws(states, across_pairs, np.flatnonzero(reach), placed, scene[rows], probe)
         worth = off < beside[rows, None]
         worth[~reach | (depth[rows] > CLEAR)] = True
+        worth &= not at_pose or np.array(RETREATS) <= LIKE_M
         found = _depths(probe, states, placed, scene[rows], worth)
         # Select the nearest clear distance, or else the least deep one.
         clear = found <= CLEAR
@@ -160,10 +167,10 @@ def clear_scene_starts(
     return best, depth
 
 
-def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], dofs: int) -> Floats:
-    out = np.zeros((len(generators), DRAWN, 2 + dofs))
+def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], numbers: int) -> Floats:
+    out = np.zeros((len(generators), DRAWN, numbers))
     for row in rows.tolist():
-        out[row] = generators[row].standard_normal((DRAWN, 2 + dofs))
+        out[row] = generators[row].standard_normal((DRAWN, numbers))
     return out
 
 
@@ -250,7 +257,7 @@ class _SceneDraws:
         self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]
     ) -> tuple[HandState, _AcrossPairs]:
         """Return hands (n * len(RETREATS)) drawn in scenes (n,) at all retreats, and the antipodal hands.
-        `reach` (n,): whether a hand is antipodal. Random numbers: uniform (n, 7), normal (n, 2 + D)."""
+        `reach` (n,): whether a hand is antipodal. Random numbers: uniform (n, 7), normal (n, 2 + D or 6 + D)."""
         n, dofs = len(uniform), self.hand.dofs
         pivot, rotation, q, away = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, dofs)), np.zeros((n, 3))
         reaching = []
@@ -270,8 +277,12 @@ class _SceneDraws:
         return hands_at_distances(pivot, rotation, q), reaching
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Place palms towards random surface points; return pivots, rotations, dofs, directions of retreat."""
+        """Place palms towards random surface points, or at the demonstrated wrist pose.
+        Return pivots, rotations, dofs, directions of retreat."""
         hand, obj = self.hand, self.obj
+        if self.wanted.like is not None:
+            state, approach = draw_at_pose(hand, obj.centre_of_mass, self.wanted.like, normal)
+            return state.pivot, state.rotation, state.q, -approach
         corners, normals, sums = surface_of(obj)
         face = np.minimum(np.searchsorted(sums, uniform[:, 0]), len(sums) - 1)
         point = points_on_triangles(corners[face], uniform[:, 1:2], uniform[:, 2:3])

@@ -46,6 +46,8 @@ OPENED_GAP: Final = (0.004, 0.02)
 TILT: Final = 0.25
 #: Noise of the pre-shape, standard deviation as a share of the joint's range.
 POSTURE_NOISE: Final = 0.08
+#: Noise of starts about a demonstrated wrist pose, standard deviations along and about each axis [m, rad].
+LIKE_NOISE: Final = (0.01, float(np.deg2rad(10.0)))
 #: Largest penetration at which a draw counts as clear [m].
 CLEAR: Final = 0.001
 #: Draws per start before the least penetrating one is selected.
@@ -105,6 +107,9 @@ def _numbers(generators: list[np.random.Generator], dofs: int) -> tuple[Floats, 
 
 def draw_starts(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState, Floats]:
     """Draw one start per generator, before any retreat; also return the palms' approaches (n, 3)."""
+    if pair.wanted.like is not None:
+        noise = np.array([rng.standard_normal(6 + pair.hand.dofs) for rng in generators])
+        return draw_at_pose(pair.hand, pair.centre, pair.wanted.like, noise)
     hand, (uniform, noise) = pair.hand, _numbers(generators, pair.hand.dofs)
     face = pair.share.searchsorted(uniform[:, 0], side="right")
     point = points_on_triangles(pair.corners[face], uniform[:, 1:2], uniform[:, 2:3])
@@ -127,6 +132,17 @@ def draw_starts(pair: _Pair, generators: list[np.random.Generator]) -> tuple[Han
     near, far = pair.gap
     pivot = point - pair.centre - approach * (near + (far - near) * uniform[:, 4:])
     return HandState(pivot, rotation, np.clip(q, hand.lower, hand.upper)), approach
+
+
+def draw_at_pose(hand: HandModel, centre: Floats, pose: Floats, noise: Floats) -> tuple[HandState, Floats]:
+    """Return hands around a wrist pose (7,), and their approaches (n, 3).
+    The random numbers `noise` (n, 6 + D) are normal; `centre` (3,) is the object's centre of mass."""
+    turn = LIKE_NOISE[1] * noise[:, 3:6]
+    angle = np.linalg.norm(turn, axis=1)
+    rotation = quat_multiply(quat_from_axis_angle(turn / np.maximum(angle, 1e-12)[:, None], angle), pose[3:])
+    pivot = pose[:3] + LIKE_NOISE[0] * noise[:, :3] - centre + quat_rotate(rotation, hand.palm.centre)
+    q = np.clip(hand.preshape + POSTURE_NOISE * hand.span * noise[:, 6:], hand.lower, hand.upper)
+    return HandState(pivot, rotation, q), quat_rotate(rotation, hand.palm.approach)
 
 
 def into_cone(approach: Floats, axis: Floats, angle: float) -> Floats:
@@ -190,8 +206,12 @@ def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: 
     return state
 
 
-def no_start_error(model: Model) -> InputError:
+def no_start_error(model: Model, wanted: Requirements = NOTHING) -> InputError:
     hand, obj = model.hand.model, model.obj.model
+    if wanted.like is not None:
+        return InputError(
+            f"{hand.name} penetrates {obj.name} at the demonstrated wrist pose: give it in metres in the object's frame"
+        )
     return InputError(
         f"{hand.name} finds no free place around {obj.name}: the object is too large or encloses the hand; "
         "check the object's units"
@@ -205,13 +225,13 @@ def clear_starts(
     The second, fourth, ... of the `each` starts of a grasp are antipodal if possible. All are antipodal if the object
     is too small or too wide for the hand's pads."""
     hand, obj = model.hand.model, model.obj.model
-    count, jaws = len(generators), JawStarts.of(hand, obj, wanted)
+    count, jaws = len(generators), JawStarts.of(hand, obj, wanted) if wanted.like is None else None
     retreats = RETREATS if jaws is None else JAW_RETREATS
     probe = Probe(model, count * len(retreats))
     pair = _Pair(hand, obj, wanted=wanted)
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
     deepest = np.full(count, np.inf)
-    if jaws is None and each > 1 and (reaching := ReachSampling.of(model, wanted)) is not None:
+    if jaws is None and wanted.like is None and each > 1 and (reaching := ReachSampling.of(model, wanted)) is not None:
         rows = np.arange(count)
         _draw_antipodal(
             reaching, generators, rows if reaching.only else rows[rows % each % 2 == 1], probe, best, deepest
@@ -239,7 +259,7 @@ def open_further(
     `clear_starts`. Better starts replace those in `state`, and their depths those in `depth`."""
     hand, obj = model.hand.model, model.obj.model
     lost = redraw & (depth > NO_PLACE)
-    if not lost.any() or JawStarts.of(hand, obj) is not None:
+    if not lost.any() or (wanted.like is None and JawStarts.of(hand, obj) is not None):
         return np.zeros(len(depth), bool)
     rows = np.flatnonzero(lost)
     probe = Probe(model, len(rows) * len(RETREATS))
