@@ -22,7 +22,7 @@ BOUNDS = st.lists(st.builds("{} {} {}".format, st.sampled_from("xyzw"), st.sampl
     ],
 )
 def test_bounds_are_half_spaces(text: str, planes: list[tuple[float, ...]]) -> None:
-    assert parse_region(text) == planes
+    assert parse_region(text).planes == tuple(planes)
 
 
 def test_cones_have_an_axis_and_an_angle() -> None:
@@ -52,13 +52,13 @@ def test_other_text_is_refused_in_one_line(option: str, text: str) -> None:
 
 @given(BOUNDS.map(", ".join) | st.lists(NUMBERS, min_size=4, max_size=4).map(", ".join) | st.text(max_size=40))
 def test_hostile_text_is_parsed_to_moderate_numbers_or_refused_in_one_line(text: str) -> None:
-    for parse in (parse_region, parse_cone):
+    for parse in (lambda text: parse_region(text).planes, parse_cone):
         try:
-            found = np.concatenate([np.ravel(part) for part in parse(text)])
+            found = np.concatenate([np.ravel(part) for part in parse(text)] or [np.zeros(0)])
         except ValueError as error:
             assert "got" in str(error) and "\n" not in str(error)
         else:
-            assert text.isascii() and (np.abs(found) <= 1e6).all()
+            assert (text.isascii() or not len(found)) and (np.abs(found) <= 1e6).all()
 
 
 @pytest.mark.parametrize(
