@@ -13,6 +13,7 @@ class JobKeywords(TypedDict, total=False):
     neighbours: Sequence[str | Mapping[str, Any]]
     scenes: int
     views: int
+    type: Literal["any", "balanced", "power", "precision", "pinch", "palmar_pinch", "prismatic_2_finger", "tripod", "prismatic_3_finger", "quadpod", "prismatic_4_finger", "precision_disk", "precision_sphere", "ring", "sphere_3_finger", "sphere_4_finger", "small_diameter", "medium_wrap", "large_diameter", "power_disk", "power_sphere", "lateral"]
     mass: float | None
     want: Literal["valid", "candidates"]
     validation: Literal["dexgraspbench", "standard", "fast", "none"]
@@ -23,6 +24,10 @@ class JobKeywords(TypedDict, total=False):
     width: int
     height: int
     channels: Sequence[Literal["distance", "normals", "occlusion"]]
+    digits: Sequence[Literal["thumb", "index", "middle", "ring", "little", "sixth"]]
+    touch_region: str
+    avoid_region: str
+    approach_cone: str
     friction: float
     density: float | None
     object_friction: float | None
@@ -44,12 +49,17 @@ class SynthesizeKeywords(TypedDict, total=False):
     scene: str | Path
     neighbours: Sequence[str | Path]
     scenes: int
+    type: Literal["any", "balanced", "power", "precision", "pinch", "palmar_pinch", "prismatic_2_finger", "tripod", "prismatic_3_finger", "quadpod", "prismatic_4_finger", "precision_disk", "precision_sphere", "ring", "sphere_3_finger", "sphere_4_finger", "small_diameter", "medium_wrap", "large_diameter", "power_disk", "power_sphere", "lateral"]
     mass: float | None
     want: Literal["valid", "candidates"]
     validation: Literal["dexgraspbench", "standard", "fast", "none"]
     robust: float
     faces: Literal["drawn", "all"]
     touch: float | None
+    digits: Sequence[Literal["thumb", "index", "middle", "ring", "little", "sixth"]]
+    touch_region: str
+    avoid_region: str
+    approach_cone: str
     friction: float
     density: float | None
     object_friction: float | None
