@@ -9,10 +9,12 @@ mkdir -p "$out"
 shadow=$data/hands/shadow/shadow_hand_right.urdf
 picture() { # type object [option ...]
     [ -z "$only" ] || [ "$only" = "$1" ] || return 0
-    cp "$data/objects/$2/clean.stl" "$work/$2.stl" # the sheet's title is the mesh's name
-    graspd synth --hand "$shadow" --object "$work/$2.stl" --mass 0.1 --type "$1" -n 2 --budget 20 --seed 4 "${@:3}" \
+    local mesh=${2#*_} # the sheet's title is the mesh's name
+    mesh=$work/${mesh#tomato_}.stl
+    cp "$data/objects/$2/clean.stl" "$mesh"
+    graspd synth --hand "$shadow" --object "$mesh" --mass 0.1 --type "$1" -n 2 --budget 20 --seed 4 "${@:3}" \
         -o "$work/$1.h5" || [ $? = 3 ] # 3: fewer grasps than wanted
-    graspd pictures "$work/$1.h5" --hand "$shadow" --object "$work/$2.stl" --three-sides --count 1 --size 200 \
+    graspd pictures "$work/$1.h5" --hand "$shadow" --object "$mesh" --three-sides --count 1 --size 150 \
         --palette -o "$out/$1.png"
 }
 picture large_diameter 005_tomato_soup_can

@@ -13,7 +13,30 @@ class JobKeywords(TypedDict, total=False):
     neighbours: Sequence[str | Mapping[str, Any]]
     scenes: int
     views: int
-    type: Literal["any", "balanced", "power", "precision", "pinch", "palmar_pinch", "prismatic_2_finger", "tripod", "prismatic_3_finger", "quadpod", "prismatic_4_finger", "precision_disk", "precision_sphere", "ring", "sphere_3_finger", "sphere_4_finger", "small_diameter", "medium_wrap", "large_diameter", "power_disk", "power_sphere", "lateral"]
+    type: Literal[
+        "any",
+        "balanced",
+        "power",
+        "precision",
+        "pinch",
+        "palmar_pinch",
+        "prismatic_2_finger",
+        "tripod",
+        "prismatic_3_finger",
+        "quadpod",
+        "prismatic_4_finger",
+        "precision_disk",
+        "precision_sphere",
+        "ring",
+        "sphere_3_finger",
+        "sphere_4_finger",
+        "small_diameter",
+        "medium_wrap",
+        "large_diameter",
+        "power_disk",
+        "power_sphere",
+        "lateral",
+    ]
     mass: float | None
     want: Literal["valid", "candidates"]
     validation: Literal["dexgraspbench", "standard", "fast", "none"]
@@ -49,7 +72,30 @@ class SynthesizeKeywords(TypedDict, total=False):
     scene: str | Path
     neighbours: Sequence[str | Path]
     scenes: int
-    type: Literal["any", "balanced", "power", "precision", "pinch", "palmar_pinch", "prismatic_2_finger", "tripod", "prismatic_3_finger", "quadpod", "prismatic_4_finger", "precision_disk", "precision_sphere", "ring", "sphere_3_finger", "sphere_4_finger", "small_diameter", "medium_wrap", "large_diameter", "power_disk", "power_sphere", "lateral"]
+    type: Literal[
+        "any",
+        "balanced",
+        "power",
+        "precision",
+        "pinch",
+        "palmar_pinch",
+        "prismatic_2_finger",
+        "tripod",
+        "prismatic_3_finger",
+        "quadpod",
+        "prismatic_4_finger",
+        "precision_disk",
+        "precision_sphere",
+        "ring",
+        "sphere_3_finger",
+        "sphere_4_finger",
+        "small_diameter",
+        "medium_wrap",
+        "large_diameter",
+        "power_disk",
+        "power_sphere",
+        "lateral",
+    ]
     mass: float | None
     want: Literal["valid", "candidates"]
     validation: Literal["dexgraspbench", "standard", "fast", "none"]

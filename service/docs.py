@@ -81,8 +81,21 @@ def keywords_stub() -> str:
     ]
     job, python = keywords_of(JobOptions, "job"), keywords_of(LocalOptions, "python")
     for title, keywords in (("JobKeywords", job), ("SynthesizeKeywords", python)):
-        parts += ["", f"class {title}(TypedDict, total=False):", *(f"    {row.name}: {text}" for row, text in keywords)]
+        parts += [
+            "",
+            f"class {title}(TypedDict, total=False):",
+            *(_keyword_line(row.name, text) for row, text in keywords),
+        ]
     return "\n".join(parts) + "\n"
+
+
+def _keyword_line(name: str, text: str) -> str:
+    """Return the line of a keyword, wrapped as by ruff."""
+    line = f"    {name}: {text}"
+    if len(line) <= _WIDTH:
+        return line
+    head, choices = line.removesuffix("]").split("[", 1)
+    return "\n        ".join([f"{head}[", *(f"{choice}," for choice in choices.split(", "))]) + "\n    ]"
 
 
 PARTS: Final[dict[str, Callable[[], str]]] = {
@@ -96,6 +109,7 @@ PARTS: Final[dict[str, Callable[[], str]]] = {
 }
 PAGES: Final = tuple(f"docs/reference/{name}.md" for name in ("settings", "dataset", "metrics", "options"))
 STUB: Final = "graspd/keywords.pyi"
+_WIDTH: Final = 120
 
 
 def update_tables(text: str) -> str:
