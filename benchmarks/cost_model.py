@@ -3,7 +3,7 @@
 usage: python -m benchmarks.cost_model [--grasps 1000000] [--grasps 100000000] [--days 7] [--scenes 2] [--views 3]
                                        [--core-hour 0.04] [--from-data DIR] [--json]
 
-`docs/explanation/scaling.md` has the formulas, the origin of each input, and the limits of the model. Prices are
+`docs/explanation/scaling.md` has the origin of each input, and the limits of the model. Prices are
 examples; replace them by your own. `--from-data` measures the sizes in your data folder."""
 
 from __future__ import annotations

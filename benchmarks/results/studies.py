@@ -645,6 +645,23 @@ STUDIES: Final = (
         seeds=(4,),
     ),
     Study(
+        "types",
+        "pictures of the types of the GRASP taxonomy",
+        ("images/types/*",),
+        ("bash benchmarks/type_gallery.sh DATA OUT/images/types",),
+        ("bash benchmarks/type_gallery.sh DATA OUT/images/types tripod",),
+        seeds=(4,),
+    ),
+    Study(
+        "choosing",
+        "success of required types, contact regions and approach cones",
+        ("results/choosing.md",),
+        ("python -m benchmarks.choosing DATA --page OUT/results/choosing.md",),
+        ("python -m benchmarks.choosing DATA --parts cones --grasps 2 --page OUT/results/choosing.md",),
+        IN_SCENES,
+        seeds=(1300,),
+    ),
+    Study(
         "scene-pictures",
         "pictures of scenes, approaches and neighbours",
         ("images/scenes/*",),

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydantic_core import from_json
 
 from graspd.service.model.clock import timestamp
+from graspd.service.model.grasp_types import TAXONOMY
 from graspd.service.model.metrics import DIRECTION_CELLS, GRASP_METRICS, GraspType, entropy_bits, evenness
 from graspd.service.model.states import AssetKind
 from graspd.service.model.version import PACKAGE_VERSION
@@ -60,6 +61,7 @@ def card_content(contents: Contents, tally: Tally, *, licence: str = "", source:
         },
         "joints": {hand: use.shares() for hand, use in tally.joints.items()},
         "repeated": sum(_repeated(cell) for cell in tally.cells.values()),
+        "taxonomy": _taxonomy(whole),
         "cells": _cells(contents, tally),
     }
 
@@ -106,6 +108,7 @@ def _provenance(contents: Contents, tally: Tally, whole: CellTally) -> Row:
         "scenes": sorted({str(spec.get("kind", "")) for spec in scenes} - {"", "free"}),
         "neighbours": sorted({str(one.get("object", "")) for spec in scenes for one in spec.get("neighbours") or ()}),
         "wants": _distinct_values(tally, "want"),
+        "requirements": _distinct_values(tally, "requirements"),
         "seeds": _distinct_values(tally, "seed"),
         "friction": _distinct_values(tally, "mu"),
         "devices": _distinct_values(tally, "device"),
@@ -199,6 +202,15 @@ def _types(cell: CellTally) -> Row | None:
         return None
     counts = {kind.name.lower(): int((told == kind).sum()) for kind in GraspType}
     return {**{name: n for name, n in counts.items() if n}, "entropy_bits": _six(entropy_bits(counts.values()))}
+
+
+def _taxonomy(cell: CellTally) -> Row | None:
+    """Return the share of each type of the GRASP taxonomy, most frequent first; None if no shard has types."""
+    told = cell.column("taxonomy_type")
+    if not len(told):
+        return None
+    shares = {name: float((told == number).mean()) for name, number in TAXONOMY.items()}
+    return {name: _six(value) for name, value in sorted(shares.items(), key=lambda one: -one[1]) if value}
 
 
 def _cells(contents: Contents, tally: Tally) -> list[Row]:

@@ -31,6 +31,8 @@ _REJECTED: Final = {
     "not_robust": "held in too few models",
     "alike": "near-duplicates",
 }
+#: Rows of a card's origins that appear only with a value.
+_OPTIONAL: Final = frozenset({"imported from", "requirements"})
 #: Metrics in the table of cells.
 _MEDIANS: Final = (
     "epsilon",
@@ -90,6 +92,7 @@ def _origins(card: Row) -> dict[str, str]:
         + ", ".join(str(found.get("name", "custom")) for found in making["fidelities"]),
         "validation": "; ".join(_LEVELS.get(level, level) for level in making["levels"]) or "none",
         "imported from": ", ".join(making["imported_from"]),
+        "requirements": "; ".join(cell_text(text) for text in making["requirements"]),
         "friction of ε and Vol": ", ".join(f"{value:g}" for value in making["friction"]),
         "contact threshold of the figures": "" if threshold is None else f"{1e3 * threshold:g} mm",
         "seeds": ", ".join(map(str, making["seeds"])),
@@ -106,7 +109,7 @@ def _origins(card: Row) -> dict[str, str]:
         ),
         "per 1,000 valid grasps": f"{total:,.0f} worker seconds ({each})" if total else "",
     }
-    return {name: value for name, value in rows.items() if value or name != "imported from"}
+    return {name: value for name, value in rows.items() if value or name not in _OPTIONAL}
 
 
 def quality_table(card: Row) -> str:

@@ -149,7 +149,7 @@ class Tally:
 
 _ATTRIBUTES: Final = (
     *("method", "fidelity", "seed", "want", "device", "worker", "code_version"),
-    *("verdict_level", "verdict_key", "mu", "source", "scene"),
+    *("verdict_level", "verdict_key", "mu", "source", "scene", "requirements"),
 )
 
 

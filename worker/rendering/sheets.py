@@ -97,10 +97,10 @@ def contact_sheet(
 def three_sides_sheet(
     pictures: NDArray[np.uint8], captions: Sequence[Sequence[tuple[str, str]]] = (), *, title: str, subtitle: str = ""
 ) -> bytes:
-    """Return a PNG of N grasps from three sides (N, 3, H, W, 3): one strip per grasp, two per row."""
+    """Return a PNG of N grasps from three sides (N, 3, H, W, 3): one strip per grasp, at most two per row."""
     seam = np.full((*pictures.shape[:1], pictures.shape[2], 4, 3), PAPER, np.uint8)
     strips = np.concatenate([part for side in np.moveaxis(pictures, 1, 0) for part in (seam, side)][1:], axis=2)
-    return contact_sheet(strips, captions, title=title, subtitle=subtitle, columns=2)
+    return contact_sheet(strips, captions, title=title, subtitle=subtitle, columns=min(2, len(strips)))
 
 
 def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
