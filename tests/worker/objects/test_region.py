@@ -102,14 +102,10 @@ def obj(*groups: tuple[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, bytes]:
     return {"m.obj": "\n".join(lines).encode()}
 
 
-def painted() -> trimesh.Trimesh:
-    meshes = [trimesh.Trimesh(*mesh, process=False) for mesh in (BODY, HANDLE)]
-    return trimesh.util.concatenate(meshes)
-
-
 def ply(encoding: str, of: int) -> dict[str, bytes]:
     """A PLY with colours of its vertices (of = 0) or of its faces (of = 1)."""
-    mesh, colours = painted(), np.repeat([RED, BLUE], len(BODY[of]), axis=0)
+    mesh = trimesh.util.concatenate([trimesh.Trimesh(*one, process=False) for one in (BODY, HANDLE)])
+    colours = np.repeat([RED, BLUE], len(BODY[of]), axis=0)
     mesh.visual = trimesh.visual.ColorVisuals(mesh, **{("vertex_colors", "face_colors")[of]: colours})
     return {"m.ply": mesh.export(file_type="ply", encoding=encoding)}
 
