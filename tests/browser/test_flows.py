@@ -1,7 +1,8 @@
-"""What users do, on a whole service with the real engine: from a file of their own to a grasp in 3D and its shard."""
+"""What users do on a whole service with the real engine: from their own file to a shard; the pages below a path."""
 
 import io
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +10,22 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from fastapi import FastAPI
 from PIL import Image
 
+from graspd.api.app import create_app
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import apply
+from graspd.service.pipeline.backends import Services
+from graspd.service.settings import Settings
 from graspd.service.store.assets import builtin_files
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.stages.models import SURFACE_POINTS
+from tests.api.factories import add_job, finish_all
+from tests.browser.conftest import serving
 from tests.waiting import until
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
@@ -145,3 +152,53 @@ def test_choosing_a_known_object_takes_a_refused_file_away(real_page: Any, tmp_p
     assert page.input_value("#file") == ""
     assert page.is_enabled("text=Submit the job")
     page.wait_for_selector("[data-thing=object] figure[data-state=ready]")
+
+
+PREFIX = "/graspd"
+
+
+@pytest.fixture
+def app(settings: Settings, services: Services) -> FastAPI:
+    return create_app(settings.model_copy(update={"api_root_path": PREFIX}), services)
+
+
+@pytest.fixture
+def address(app: FastAPI) -> Iterator[str]:
+    with serving(app) as outer:
+        yield f"{outer}{PREFIX}"
+
+
+@pytest.mark.slow
+def test_every_part_of_the_dashboard_works_below_the_path(page: Any, services: Services, address: str) -> None:
+    job = add_job(services, grasps=6, scenes=1, views=1)
+    page.goto(f"{address}/")
+    page.click(f"a[href='{PREFIX}/jobs/{job.id}'] >> nth=0")
+    page.wait_for_selector("#head .queued")
+    page.evaluate("window.stayed = true")
+    finish_all(services, job)
+    page.wait_for_selector("#head .succeeded")
+    page.wait_for_selector("#best canvas[data-state=ready]")
+    page.wait_for_selector("#views img")
+    assert page.evaluate("window.stayed && [...document.querySelectorAll('#views img')].every((one) => one.src)")
+    page.click("#best a[href*='/grasps/'] >> nth=0")
+    page.wait_for_selector("figure[data-state=ready]")
+    page.goto(f"{address}/hands/shadow")
+    page.wait_for_selector("figure[data-state=ready]")
+
+    page.goto(f"{address}/submit")
+    page.select_option("#hand", "barrett")
+    page.select_option("#object", "mug")
+    page.wait_for_selector("[data-thing=hand] figure[data-state=ready]")
+    with page.expect_response(f"**{PREFIX}/submit?*"):
+        page.fill("#grasps", "8")
+        page.locator("#grasps").blur()
+    page.click("text=Submit the job")
+    page.wait_for_url(f"**{PREFIX}/jobs/*")
+    page.click("button:has-text('Cancel')")
+    page.wait_for_selector("#head .cancelled")
+
+    page.goto(f"{address}/submit")
+    block = builtin_files(AssetKind.OBJECT, "block")["block.stl"]
+    with page.expect_response(f"**{PREFIX}/v1/objects") as sent:
+        page.set_input_files("#file", {"name": "mine.stl", "mimeType": "model/stl", "buffer": block})
+    assert sent.value.ok

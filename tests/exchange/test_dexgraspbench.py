@@ -18,7 +18,7 @@ from graspd.exchange import dexgraspbench
 from graspd.exchange.bench_hand import body_names
 from graspd.exchange.bench_scene import check_table
 from graspd.service.model.errors import InputError
-from graspd.service.model.transforms import compose, invert, quat_to_matrix
+from graspd.service.model.transforms import invert, quat_to_matrix
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import body_poses
@@ -385,17 +385,6 @@ def test_the_way_in_ends_at_the_pregrasp_and_scenes_have_a_table(tabletop: Path,
         assert table["type"] == "plane" and table["pose"].tolist() == [0, 0, 0, 1, 0, 0, 0]
         for key in ("file_path", "info_path", "urdf_path"):
             assert (path.parent / thing[key]).is_file()
-
-
-def test_its_loader_puts_the_hand_where_it_stands(tabletop: Path, hand, candidates: Shard) -> None:
-    file = files_of(tabletop, CONFIG, EXPERIMENT)[-1]
-    found = load(tabletop, file, CONFIG, tabletop=True)
-    found.at(found.grasp["grasp_qpos"])
-    row = int(file.stem)
-    pose, joints = (candidates[f"grasp/{name}"][row : row + 1] for name in ("hand_pose", "joint_positions"))
-    for name, ours in zip(body_names(hand), body_poses(hand, pose, joints)[0], strict=True):
-        there = compose(found.grasp["obj_pose"], ours)
-        np.testing.assert_allclose(found.data.body(PREFIX + name).xpos, there[:3], atol=ROUNDING_M)
 
 
 def test_its_tabletop_test_says_what_our_letter_says(tabletop: Path, shard: Path) -> None:

@@ -30,8 +30,6 @@ from tests.worker.commands_run import graspd, refused
 
 RUN_KEYS = {"method", "fidelity", "hand", "object", "valid_per_second", "seconds_to_first_valid", "gsr", "epsilon"}
 RUN_KEYS |= {"pd_mm", "end_to_end_per_second", "dexgraspbench", "hard", "robust"}
-
-
 QUICK = "chart --quick --methods fast_graspd,autograsp --hands barrett --objects block"
 CROWDS = {
     "beside each other": [(10.0, 0.98), (13.0, 0.95), (14.0, 0.93), (22.0, 0.94)],

@@ -51,7 +51,6 @@ CLAW = """
   <sensor><jointpos joint="wrist"/></sensor>
 </mujoco>
 """
-
 #: A four-bar finger: the coupler is held to the follower by a constraint, not by the tree.
 FOUR_BAR = """
 <mujoco>
@@ -81,7 +80,6 @@ FOUR_BAR = """
   <actuator><position joint="drive" kp="5"/><position joint="thumb" kp="5"/></actuator>
 </mujoco>
 """
-
 #: Two fingers whose ends hang on tendons of fixed length: the left one's follows it, the right one's limits forbid that
 #: and hold it, and its tip with it. Angles are radians although nobody says so; servos go half the way of the joints.
 TENDON_CLAW = """

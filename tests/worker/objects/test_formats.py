@@ -459,8 +459,6 @@ def test_a_hint_of_units_fits_the_size(length: float, units: str, likely: list[s
 
 
 WORDS = [b"nan", b"1e999", b"-1", b"0", b"999999999", b"\n", b"f 1 2 3\n", b"\xff\xff\xff\xff", b"\x7f\x7f\x80\0", b"{"]
-
-
 #: A file of any format, damaged.
 MUTATED = st.sampled_from(sorted(FILES)).flatmap(lambda name: st.tuples(st.just(name), damaged(FILES[name], WORDS)))
 

@@ -25,7 +25,6 @@ from graspd.worker.scenes import Neighbours
 from tests.worker.models import object_from_mesh, two_finger_hand, unit_vectors
 
 DEPTH_M = 1e-4  # what a view promises of its depth [m]; float32 rays over half a metre err by less than a tenth of it
-
 SIZE = (96, 72)
 RADIUS = 0.05
 REST = np.array([[0.02, -0.01, RADIUS, 1.0, 0, 0, 0], [0.0, 0.03, RADIUS, 0, 1.0, 0, 0]])

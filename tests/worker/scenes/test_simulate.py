@@ -25,8 +25,6 @@ from tests.worker.models import object_from_mesh
 ROUNDING_M = 1e-9
 #: Vertices this close to the table carry the object: its hull faces are merged up to 0.05 degrees over 0.2 m.
 CONTACT_M = 2e-4
-
-
 UP = np.array([0.0, 0, 1])
 
 

@@ -29,8 +29,6 @@ from tests.worker.simulation.rigs import ball, rig, still
 _GOLDEN = (np.sqrt(5) - 1) / 2
 HANDS = ("allegro", "barrett", "shadow")
 EACH_HAND = pytest.mark.parametrize("name", HANDS)
-
-
 Energy = Callable[[HandState], float]
 #: float32 depths of 1e-3 m from coordinates of 0.1 m are good to 1e-5 relative; points that enter or leave within the
 #: difference add the rest.

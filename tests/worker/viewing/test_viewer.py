@@ -26,7 +26,6 @@ from tests.worker.commands_run import refused
 from tests.worker.models import attributes_of, object_from_mesh, quality_columns, two_finger_hand
 
 viser = pytest.importorskip("viser", reason="needs the extra: pip install graspd[view]")
-
 HAND = two_finger_hand()
 BLOCK = object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
 GRASPS = 3
