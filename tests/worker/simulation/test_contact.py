@@ -27,7 +27,7 @@ from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.simulation import launches, reference
 from graspd.worker.simulation.data import Data, HandState, allocate_contacts, still_schedule
 from graspd.worker.simulation.device import DeviceHand, DeviceObject
-from graspd.worker.simulation.kernels import packing, projection, wrenches
+from graspd.worker.simulation.kernels import packing, wrenches
 from graspd.worker.simulation.kernels import projection as kernels
 from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
 from graspd.worker.simulation.launches import Launches
@@ -269,7 +269,7 @@ def test_the_projection_holds_no_point_that_must_not_touch() -> None:
     contacts.count.fill_(2)
     step.residuals.count.zero_()
     inputs = [2, data.hands, contacts, step.options.near, step.options.target, 2e-3, 5e-4, 0.02]
-    wp.launch(projection.point_residuals, (1, 1), inputs=inputs, outputs=[step.residuals], device="cpu")
+    wp.launch(kernels.point_residuals, (1, 1), inputs=inputs, outputs=[step.residuals], device="cpu")
     assert step.residuals.body.numpy()[0, : step.residuals.count.numpy()[0]].tolist() == [2]
 
 
