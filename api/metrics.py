@@ -31,13 +31,13 @@ class Metrics:
         self._requests.labels(method, route, str(status)).inc()
         self._seconds.labels(method, route).observe(seconds)
 
-    def render(self, service: Snapshot) -> bytes:
+    def render(self, service: MetricsSnapshot) -> bytes:
         snapshot = CollectorRegistry()
         snapshot.register(service)
         return generate_latest(self.registry) + generate_latest(snapshot)
 
 
-class Snapshot:
+class MetricsSnapshot:
     """State of the service at a scrape. Series of parts that do not answer are omitted."""
 
     def __init__(self) -> None:

@@ -35,7 +35,7 @@ from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.model import MujocoOptions, scene_of
-from graspd.worker.validation.payload import LIFTING, LiftPayload, PushPayload, limit_of
+from graspd.worker.validation.payload import LIFTING, LiftPayload, PushPayload, payload_limit
 from graspd.worker.validation.protocol import DIRECTIONS, Outcome, Rollout
 
 SEED: Final = 1500
@@ -146,7 +146,7 @@ def of_pair(given: Any, hand: HandModel, name: str, mass: float) -> tuple[Floats
             milliseconds[k, row] = 1e3 * (time.process_time() - began)
     # Grasps are valid, so they lift at least the object.
     kilograms = np.nan_to_num(kilograms, nan=obj.mass)
-    strongest = limit_of(
+    strongest = payload_limit(
         hand,
         obj,
         squeezed(hand, obj, grasps),

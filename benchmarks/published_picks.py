@@ -33,14 +33,14 @@ from graspd.service.model.transforms import quat_rotate
 from graspd.worker.control.postures import TOTAL_NORMAL_FORCE, squeeze
 from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.quality.intervals import wilson
+from graspd.worker.quality.intervals import wilson_interval
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import RISE_M, Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lift import Lift, LiftOutcome
 from graspd.worker.validation.lifting import validate_lifts
-from graspd.worker.validation.model import MujocoOptions, build
+from graspd.worker.validation.model import MujocoOptions, build_scene
 from graspd.worker.validation.protocol import STAGE_S, Outcome, Rollout
 from graspd.worker.validation.validator import validate
 
@@ -148,7 +148,7 @@ def picked(case: Case, pieces: ConvexPieces, terms: Terms) -> dict[str, Any]:
         grasps = replace(grasps, pregrasp=grasps.grasp)
     placed = on_table(case)
     obj = obj.with_mass(density=DENSITY) if terms.light else obj
-    scene = build(hand, obj, pieces, MujocoOptions(friction=(terms.friction, 0.02)), placed.supports)
+    scene = build_scene(hand, obj, pieces, MujocoOptions(friction=(terms.friction, 0.02)), placed.supports)
 
     def part(rows: range) -> list[tuple[str, float]]:
         test = Pick(scene, placed, terms)
@@ -270,7 +270,7 @@ def row(words: str, held: NDArray[np.bool_], margin: Floats | None, truth: NDArr
         "n": len(truth),
         "holds": float(held.mean()),
         "agreement": agree / len(truth),
-        "interval": [round(bound, 4) for bound in wilson(agree, len(truth))],
+        "interval": [round(bound, 4) for bound in wilson_interval(agree, len(truth))],
         "fails_both": right,
         "fails_here_alone": wrong,
         "p_against_constant": chance,

@@ -222,7 +222,9 @@ def beside(url: str | None) -> None:
                 job, answered = post(http, small, 32)
                 began, task = time.perf_counter(), task_id(job, Stage.SYNTHESIZE, 0)
                 # A task that a worker has taken is no longer in the queue, nor queued in the index.
-                while task not in services.queue.waiting() and services.index.jobs.task(task).state is State.QUEUED:
+                while (
+                    task not in services.queue.waiting_tasks() and services.index.jobs.task(task).state is State.QUEUED
+                ):
                     time.sleep(0.01)
                 answers.append(answered)
                 queued.append(answered + time.perf_counter() - began)

@@ -46,10 +46,10 @@ def write_hand(hand: HandModel, config: str, root: Path) -> Path:
 
 def body_names(hand: HandModel) -> tuple[str, ...]:
     """Return the names (L,) of the hand's bodies in the model."""
-    return tuple(f"{'root' if b == 0 else _finger(hand, b)}_{name}" for b, name in enumerate(hand.body_names))
+    return tuple(f"{'root' if b == 0 else _finger_prefix(hand, b)}_{name}" for b, name in enumerate(hand.body_names))
 
 
-def _finger(hand: HandModel, body: int) -> str:
+def _finger_prefix(hand: HandModel, body: int) -> str:
     """Return the finger of a body, numbered by the child of the root that leads to the body."""
     return f"f{np.flatnonzero(hand.parent == 0).tolist().index(hand.chain(body)[-1])}"
 
@@ -57,7 +57,7 @@ def _finger(hand: HandModel, body: int) -> str:
 def _configuration(hand: HandModel, model: Path) -> str:
     """Return the configuration as JSON, which is valid YAML."""
     names = body_names(hand)
-    fingers = [f"{_finger(hand, int(b))}_" for b in np.flatnonzero(hand.parent == 0)]
+    fingers = [f"{_finger_prefix(hand, int(b))}_" for b in np.flatnonzero(hand.parent == 0)]
     values: dict[str, Any] = {
         "xml_path": model.as_posix(),
         "mocap": True,
@@ -98,7 +98,7 @@ def _model(hand: HandModel) -> Element:
     return top
 
 
-def _joint_of(hand: HandModel, body: int) -> str:
+def _joint_name(hand: HandModel, body: int) -> str:
     return hand.joint_names[hand.joint_body.tolist().index(body)]
 
 
@@ -108,7 +108,7 @@ def _add_joint(body: Element, hand: HandModel, b: int) -> None:
     SubElement(
         body,
         "joint",
-        name=_joint_of(hand, b),
+        name=_joint_name(hand, b),
         axis=_text(hand.axis[b]),
         range=_text(ends),
         type="hinge" if hand.joint_type[b] == JointType.REVOLUTE else "slide",
@@ -154,11 +154,11 @@ def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
         lead, *others = [int(b) for b in hand.joint_body if hand.dof[b] == d]
         m = float(hand.multiplier[lead])
         gain, limit = float(hand.stiffness[d]) / m**2, float(hand.effort[d]) / abs(m)
-        _add_actuator(actuators, name, {"joint": _joint_of(hand, lead)}, gain, limit)
+        _add_actuator(actuators, name, {"joint": _joint_name(hand, lead)}, gain, limit)
         for b in others:
             ratio = float(hand.multiplier[b]) / m
             start = float(hand.offset[b]) - ratio * float(hand.offset[lead])
-            pair = {"joint1": _joint_of(hand, b), "joint2": _joint_of(hand, lead)}
+            pair = {"joint1": _joint_name(hand, b), "joint2": _joint_name(hand, lead)}
             SubElement(equality, "joint", {**pair, "polycoef": _text([start, ratio, 0, 0, 0]), **_COUPLING})
 
 
@@ -219,16 +219,16 @@ class HandMapping:
         (folder / FILE).write_text(json.dumps(said, indent=1) + "\n")
 
 
-def mapping_of(file: Path) -> HandMapping | None:
+def load_mapping(file: Path) -> HandMapping | None:
     """Load the mapping of a grasp file's experiment; None if there is none. Raises InputError: it is invalid."""
     for above in file.resolve().parents:
         if above.name in _FOLDERS:
-            return _read(above.parent / FILE)
+            return _read_mapping(above.parent / FILE)
     return None
 
 
 @lru_cache(maxsize=64)
-def _read(path: Path) -> HandMapping | None:
+def _read_mapping(path: Path) -> HandMapping | None:
     if not path.is_file():
         return None
     try:

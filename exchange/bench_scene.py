@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 
 from graspd.exchange.bench_hand import HandMapping
-from graspd.exchange.imported import load_npy, mesh_file, urdf_of, write_obj
+from graspd.exchange.imported import load_npy, urdf_of, write_mesh, write_obj
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
@@ -40,7 +40,7 @@ def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
     folder, scene = SET / "processed_data" / name, SET / "scene_cfg" / name / "floating" / f"{SCALE}.npy"
     for part in (folder / "mesh", folder / "info", folder / "urdf" / "meshes", SET / "valid_split"):
         (root / part).mkdir(parents=True, exist_ok=True)
-    mesh_file(obj, root / folder / "mesh" / "simplified.obj")
+    write_mesh(obj, root / folder / "mesh" / "simplified.obj")
     pieces = [hull(corners) for corners in decompose(obj).vertices]
     meshes = root / folder / "urdf" / "meshes"
     # The evaluator reads all files of this folder as pieces, so those of an earlier export are removed.
@@ -112,7 +112,7 @@ def tabletop_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row
     }
 
 
-def tables_at(obj_pose: Floats) -> PlacedGrasps:
+def scenes_on_tables(obj_pose: Floats) -> PlacedGrasps:
     """Return scenes with the object at its poses (N, 7) on a table; equal poses share a scene."""
     _, first, index = np.unique(np.round(obj_pose / SAME), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -142,7 +142,7 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
     return {"obj_pose": pose, "obj_scale": float(scale[0])}
 
 
-def with_trajectory(
+def add_trajectory(
     hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> GraspSet:
     """Add approach and lift (object frame) if all approaches have the same number of waypoints and fixed joints."""

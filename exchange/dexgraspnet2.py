@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from graspd.exchange.imported import ImportedGrasps, add_postures, joints_by_name, parse_verdicts, scaled_object
-from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene, plain_name
+from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, group_by_scene, plain_name
 from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import (
@@ -198,7 +198,7 @@ def write(
     if top.exists():
         raise InputError(f"{top} exists already; give another folder as --output")
     known = {lot.id: lot for lot in lots}
-    seen = by_scene(pictures)
+    seen = group_by_scene(pictures)
     scenes = [some for some in seen if some[0].base in known and len(some[0].rows)]
     if not scenes:
         if any(some[0].base in known for some in seen):

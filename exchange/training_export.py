@@ -61,7 +61,7 @@ def _export_parts(shards: Shards, format_: str, wishes: TrainingExportOptions) -
     lots: list[ExportPart] = []
     digests: dict[str, str] = {}
     refused: InputError | None = None
-    for file in shards.of("base"):
+    for file in shards.of_kind("base"):
         path = shards.path(file)
         shard = read_shard(path, kind="base")
         try:

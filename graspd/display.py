@@ -32,7 +32,7 @@ _MORE: Final = {
 }
 
 
-def frame_of(grasps: Grasps) -> Any:
+def data_frame_of(grasps: Grasps) -> Any:
     try:
         import pandas
     except ModuleNotFoundError:

@@ -111,7 +111,7 @@ class Grasps:
         if isinstance(rows, int | np.integer):
             if not -len(self) <= rows < len(self):
                 raise IndexError(f"there is no grasp {rows}; of {len(self)} the last is {len(self) - 1}")
-            return self._one(int(rows) % len(self))
+            return self._grasp_at(int(rows) % len(self))
         chosen = rows if isinstance(rows, slice) else np.asarray(rows)
         if isinstance(chosen, np.ndarray) and not len(chosen):
             chosen = chosen.astype(int)
@@ -269,9 +269,9 @@ class Grasps:
         Raises:
             InputError: pandas is not installed.
         """
-        from graspd.display import frame_of
+        from graspd.display import data_frame_of
 
-        return frame_of(self)
+        return data_frame_of(self)
 
     def plot(self, count: int = 4, *, edge: int = 320) -> Image:
         """Draw the best grasps by epsilon on one sheet, valid ones first, each in a square of `edge` pixels.
@@ -337,7 +337,7 @@ class Grasps:
             raise InputError(f"these grasps have no metric {name!r}; they have {', '.join(self.metrics)}")
         return metric
 
-    def _one(self, row: int) -> Grasp:
+    def _grasp_at(self, row: int) -> Grasp:
         joints = dict(zip(self.joint_names, map(float, self.joint_positions[row]), strict=True))
         metrics = {name: float(self.metric(name)[row]) for name in self.metrics}
         return Grasp(self.hand_pose[row], joints, bool(self.is_valid[row]), metrics)
@@ -364,7 +364,9 @@ def open(
         DamagedError: a file does not match its checksum.
     """
     shards = open_shards(source, job=job, dataset=dataset)
-    return concatenate([read_shard(shards.path(file), kind="base") for file in _of_hand(shards, hand).of("base")])
+    return concatenate(
+        [read_shard(shards.path(file), kind="base") for file in _select_hand(shards, hand).of_kind("base")]
+    )
 
 
 def concatenate(shards: Sequence[Shard]) -> Grasps:
@@ -393,10 +395,10 @@ def concatenate(shards: Sequence[Shard]) -> Grasps:
     return Grasps(columns, first.attributes, first.path)
 
 
-def _of_hand(shards: Shards, hand: str | None) -> Shards:
-    hands = sorted({file.hand for file in shards.of("base")})
+def _select_hand(shards: Shards, hand: str | None) -> Shards:
+    hands = sorted({file.hand for file in shards.of_kind("base")})
     if hand is not None and hand not in hands:
         raise InputError(f"there are no grasps of the hand {hand!r}; hands with grasps: {', '.join(hands) or 'none'}")
     if hand is None and len(hands) > 1:
         raise InputError(f"these are grasps of {', '.join(hands)}; name one of them: hand={hands[0]!r}")
-    return shards.only(hands=[hand]) if hand else shards
+    return shards.select(hands=[hand]) if hand else shards

@@ -57,7 +57,7 @@ def bench(
     for fidelity in fidelities:
         obj = load(fidelity.face_error_m)
         for batch, join, count in product(batches, joins, threads):
-            run = _run(hand, obj, fidelity, batch, join, ExecutionContext(device, count), repeats)
+            run = _time_combination(hand, obj, fidelity, batch, join, ExecutionContext(device, count), repeats)
             runs.append(run)
             say(
                 f"{fidelity.name:9s} batch {batch:5d} x {join} threads {count}: {run['grasps_per_second']:8.1f} "
@@ -88,7 +88,7 @@ def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: 
     return {"first_grasp_s": seconds[0], "next_grasp_s": seconds[1]}
 
 
-def _run(
+def _time_combination(
     hand: HandModel, obj: ObjectModel, fidelity: Fidelity, batch: int, join: int, run: ExecutionContext, repeats: int
 ) -> dict[str, Any]:
     seconds = []
@@ -139,7 +139,7 @@ def kernel_shares(pair: Pair, fidelity: Fidelity, count: int) -> dict[str, Any]:
         model = pair.model(side)
         data = Data(model, count)
         used = _iterations_used(model, data, state, schedule, fidelity, name)
-        times, state = _timed(model, data, state, schedule, fidelity)
+        times, state = _time_kernels(model, data, state, schedule, fidelity)
         total = sum(times.values())
         phases[name] = {
             "iterations_to_convergence": round(used, 1),
@@ -167,7 +167,7 @@ def _iterations_used(
     return alive / len(state.pivot)
 
 
-def _timed(
+def _time_kernels(
     model: Model, data: Data, state: HandState, schedule: Schedule, fidelity: Fidelity
 ) -> tuple[dict[str, float], HandState]:
     """Return each kernel's median seconds over `SAMPLED` middle iterations, and the hands at the end."""
@@ -180,7 +180,7 @@ def _timed(
     wp.synchronize_device(data.device)
     found: dict[str, list[float]] = {}
     for _ in range(sampled):
-        for name, command in launches.named():
+        for name, command in launches.named_commands():
             began = time.perf_counter()
             command.launch()
             wp.synchronize_device(data.device)

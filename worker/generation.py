@@ -33,14 +33,14 @@ from graspd.worker.quality.diversity import POINTS, distinct_mask, hand_points
 from graspd.worker.quality.gate import GATES, failed_gate, passes_gate
 from graspd.worker.quality.table import measure
 from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, expected_need, next_round, select_rows, split_rows
-from graspd.worker.scenes.rollout import lift_level, outcomes_in_scenes, rollout_on, scene_verdicts
+from graspd.worker.scenes.rollout import create_rollout, lift_level, outcome_masks, scene_verdicts
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.lifting import lift_key, validate_lifts
-from graspd.worker.validation.payload import ENOUGH, Limit, limit_of, payloads, shake_margins
+from graspd.worker.validation.payload import ENOUGH, PayloadLimit, payload_limit, payloads, shake_margins
 from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, prefilter_key_terms
 from graspd.worker.validation.protocol import DIRECTIONS, Outcome
 from graspd.worker.validation.robust import reaches_share, validate_robustness
@@ -88,7 +88,7 @@ class ValidatedBatch:
     lift_share: also lifted. lift_hard_share: also lifted at half friction."""
     narrow: str | None = None
     """In scenes without a valid grasp, the geometric reason; see `narrow_reason`."""
-    limit: Limit | None = None
+    limit: PayloadLimit | None = None
     """Payload limit of the tested grasps, if no grasp is selected because the object is too heavy."""
 
     def moved(self, by: Sequence[float]) -> ValidatedBatch:
@@ -181,7 +181,9 @@ class Scoring(AbstractContextManager["Scoring"]):
         if self.pieces is None:
             return None
         pieces, in_scenes = self.pieces.result, self.scenes is not None
-        return rollout_on(self.run, self.hand, self.obj, pieces, in_scenes=in_scenes, known=known, level=self._level)
+        return create_rollout(
+            self.run, self.hand, self.obj, pieces, in_scenes=in_scenes, known=known, level=self._level
+        )
 
     def key(self) -> str:
         assert self.pieces is not None
@@ -225,7 +227,7 @@ class Scoring(AbstractContextManager["Scoring"]):
             planned, columns = self._validate(planned, run.part(*PARTS[:2]), known, prefilter)
         if self.scenes is not None:
             fates[finite[columns["quality/success"] < 0]] = "no_place"
-            for name, those in outcomes_in_scenes(columns).items():
+            for name, those in outcome_masks(columns).items():
                 in_scene[name] = np.zeros(len(fates), bool)
                 in_scene[name][finite] = those
         why = _rejection_reasons(columns, size)
@@ -290,12 +292,12 @@ class Scoring(AbstractContextManager["Scoring"]):
         """Return columns of the further tests that the request specifies.
         Grasps `in_models` (N,) are tested for robustness, `valid` grasps (N,) for payload and in the shake test."""
         request, columns = self.request, dict[str, NDArray[Any]]()
-        if not (request.models or request.measures_payload or request.shake):
+        if not (request.model_count or request.measures_payload or request.shake):
             return columns
         assert self.pieces is not None
         common: dict[str, Any] = {"pieces": self.pieces.result(), "run": run}
         placed = self.placed(grasps)
-        if request.models:
+        if request.model_count:
             columns |= validate_robustness(
                 self.hand,
                 self.obj,
@@ -303,7 +305,7 @@ class Scoring(AbstractContextManager["Scoring"]):
                 held=in_models,
                 placed=placed,
                 level=lift_level(request.validation),
-                models=request.models,
+                models=request.model_count,
                 seed=request.seed,
                 wanted=request.robust if request.want == "valid" else 0,
                 **common,
@@ -353,7 +355,7 @@ class Batch:
         self.request = scoring.request
         self.rounds: list[Round] = []
         self.candidates = self.repeated = 0
-        self.limit: Limit | None = None
+        self.limit: PayloadLimit | None = None
         self.seconds: dict[str, float] = {"planner": 0.0, "validation": 0.0, "quality": 0.0}
         every = range(0 if scoring.scenes is None else len(scoring.scenes.object_pose))
         self._scenes = every if scenes is None else scenes
@@ -412,7 +414,7 @@ class Batch:
             scoring.run.without_progress(),
             max(obj.mass, self.request.min_payload),
         )
-        self.limit = limit_of(hand, obj, planned, wanted=wanted, pieces=pieces, placed=placed, run=run)
+        self.limit = payload_limit(hand, obj, planned, wanted=wanted, pieces=pieces, placed=placed, run=run)
         return self.limit is not None and self.limit.is_far_exceeded
 
     @property
@@ -461,7 +463,7 @@ class Batch:
             beside = poses.neighbour_pose[own] if poses.neighbours else poses.neighbour_pose
             mine = replace(poses, object_pose=poses.object_pose[own], neighbour_pose=beside)
             placed = mine.placed((asked.begun + np.array(rows)) % len(self._scenes))
-        knobs, seed = self.request.knobs, self.request.seed
+        knobs, seed = self.request.resolved_fidelity, self.request.seed
         return PlanRequest(len(rows), knobs, seed, number, placed, rollout, rows.start, others_have_place)
 
     def grasps_to_store(self, wanted: PlanRequest, planned: GraspSet) -> GraspSet:

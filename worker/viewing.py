@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
-from graspd.service.model.scene_spec import Box, SceneSpec, supports_in
+from graspd.service.model.scene_spec import Box, SceneSpec, scene_supports
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
 from graspd.service.readers.trajectories import (
     Waypoint,
-    point_at,
     scene_spec_of,
     slider_positions,
     trajectory_of,
-    wrists_of,
+    waypoint_at,
+    wrist_angles,
 )
 from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
@@ -162,7 +162,7 @@ class Viewer:
         self._rows = next(iter(self._choices.values()))
         self._at, self._lock = 0, threading.RLock()
         spec = scene_spec_of(shown.shard) or SceneSpec()
-        self._supports: Supports = supports_in(spec)
+        self._supports: Supports = scene_supports(spec)
         self.server = _served(host, port)
         self.models = Models(self.server.scene, shown.hand, shown.obj, mounted=self._wrist is not None)
         self._way = trajectory_of(shown.shard, self.row)
@@ -175,7 +175,7 @@ class Viewer:
 
     @property
     def _wrist(self) -> Floats | None:
-        return wrists_of(self._shown.shard, np.array([self.row]))
+        return wrist_angles(self._shown.shard, np.array([self.row]))
 
     @property
     def url(self) -> str:
@@ -213,7 +213,7 @@ class Viewer:
         """Draw the posture at the slider's position."""
         with self._lock:
             place = float(self.slider.value)
-            point, contacts = point_at(self._way, place), bool(self._contacts.value)
+            point, contacts = waypoint_at(self._way, place), bool(self._contacts.value)
             distance = self.models.pose(point, wrist=self._wrist, contacts=contacts)
             self.models.show_scene(bool(self._scene.value))
             touching, least = int((distance < 0.001).sum()), 1e3 * float(distance.min())

@@ -52,7 +52,7 @@ def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
     """Return the key of a request, or None while no key is needed; raise ApiError 401 or 403."""
     keys: KeyFile = request.app.state.keys
     if keys.is_open:
-        _refuse_strangers(request)
+        _require_local_request(request)
         return None
     key: Key | None = request.scope.get("state", {}).get("key")
     if key is None:
@@ -68,7 +68,7 @@ def is_still_authorized(request: HTTPConnection, scope: Scope) -> bool:
     keys: KeyFile = request.app.state.keys
     if keys.is_open:
         return True
-    key = identify(request.scope, keys, request.app.state.proxy)
+    key = authenticate(request.scope, keys, request.app.state.proxy)
     return key is not None and key.scope.includes(scope)
 
 
@@ -98,7 +98,7 @@ def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
     return True
 
 
-def _refuse_strangers(request: HTTPConnection) -> None:
+def _require_local_request(request: HTTPConnection) -> None:
     """Refuse requests from other machines, and from proxies, because these may forward any request."""
     header = next((name for name in _OF_PROXIES if name in request.headers), None)
     address = request.client.host if request.client else ""
@@ -108,7 +108,7 @@ def _refuse_strangers(request: HTTPConnection) -> None:
         raise ApiError(403, f"{problem}; make a key with `graspd keys add NAME --scope admin`")
 
 
-def identify(scope: AsgiScope, keys: KeyFile, proxy: Proxy) -> Key | None:
+def authenticate(scope: AsgiScope, keys: KeyFile, proxy: Proxy) -> Key | None:
     """Return the key of a request: by its Bearer token, by the proxy, or by its session cookie."""
     scheme, _, token = Headers(scope=scope).get("authorization", "").partition(" ")
     if scheme.lower() == "bearer" and token:

@@ -49,12 +49,12 @@ class Shards:
         page = self._services.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor, scope=project_scope())
         return Page[Shard](items=[_shard(shard) for shard in page.items], next=page.next)
 
-    def one(self, shard_id: str) -> Shard:
+    def get(self, shard_id: str) -> Shard:
         return _shard(self._services.index.shards.get(shard_id, scope=project_scope()))
 
     def get_intact(self, shard_id: str) -> Shard:
         """Return a shard, and check its file against its checksum if the file changed since the last check."""
-        shard = self.one(shard_id)
+        shard = self.get(shard_id)
         self._checked.check(shard.key, shard.sha256)
         return shard
 
@@ -100,7 +100,7 @@ class Jobs:
         if idempotency_key is not None:
             bound = self._idempotency.claim(key.name if key else "", idempotency_key, request)
         with bound:
-            record = job_actions.prepare(self._services, request, owner=caller_id(), scope=project_scope())
+            record = job_actions.prepare_job(self._services, request, owner=caller_id(), scope=project_scope())
             with bind_subjects(job=record.id), self._quotas.claim(key, record.id, record.request.grasps) as claim:
                 job, is_new = job_actions.enter_job(self._services, record)
                 claim.counts = is_new
@@ -109,21 +109,21 @@ class Jobs:
         return self._detail(job).model_copy(update={"choice": record.choice or job.choice})
 
     def cancel(self, job_id: str) -> JobDetail:
-        self._owned(job_id)
+        self._get_owned(job_id)
         with bind_subjects(job=job_id):
             job = job_actions.cancel(self._services, job_id)
             log.info("job cancelled")
         return self._detail(job)
 
     def retry(self, job_id: str) -> JobDetail:
-        grasps = self._owned(job_id).request.grasps
+        grasps = self._get_owned(job_id).request.grasps
         with bind_subjects(job=job_id), self._quotas.claim(caller.get(), job_id, grasps, is_new=False):
             job = job_actions.retry(self._services, job_id)
             log.info("job retried")
         return self._detail(job)
 
     def delete(self, job_id: str) -> None:
-        self._owned(job_id)
+        self._get_owned(job_id)
         with bind_subjects(job=job_id):
             deletion.delete_job(self._services, job_id, owner=caller_id())
             log.info("job deleted")
@@ -143,14 +143,14 @@ class Jobs:
         )
         return Page[Job](items=[self._job(job, ()) for job in page.items], next=page.next)
 
-    def one(self, job_id: str) -> JobDetail:
+    def get(self, job_id: str) -> JobDetail:
         return self._detail(self._services.index.jobs.get(job_id, scope=project_scope()))
 
     def get_progress(self, job_id: str) -> Job:
         """Return a job with only the progress of its stages, for event streams."""
-        return self._job(self._services.index.jobs.get(job_id, scope=project_scope()), self._running(job_id))
+        return self._job(self._services.index.jobs.get(job_id, scope=project_scope()), self._reported_tasks(job_id))
 
-    def _owned(self, job_id: str) -> JobView:
+    def _get_owned(self, job_id: str) -> JobView:
         job = self._services.index.jobs.get(job_id, scope=project_scope())
         require_ownership(job.owner, f"job {job_id}", job.project)
         return job
@@ -160,7 +160,7 @@ class Jobs:
         mean = {data.metric: data.mean for data in histograms}
         shards = self._shards.page(job=job.id, limit=_PAGE).items
         return JobDetail(
-            **self._job(job, self._running(job.id)).model_dump(),
+            **self._job(job, self._reported_tasks(job.id)).model_dump(),
             **{name: getattr(job, name) for name in _DETAILS},
             attempts=self._services.index.jobs.attempts(job=job.id, limit=50),
             mean=MeanMetrics(**{metric: mean.get(metric) for metric in MEAN_METRICS}),
@@ -174,7 +174,8 @@ class Jobs:
         tasks = sum(stage.tasks for stage in job.stages)
         return Job(
             **{name: getattr(job, name) for name in _SHARED},
-            **{name: getattr(request, name) for name in ("hand", "object", "method", "standing")},
+            **{name: getattr(request, name) for name in ("hand", "object", "method")},
+            standing=request.displayed_status,
             fidelity=request.fidelity if isinstance(request.fidelity, str) else request.fidelity.name,
             requested=request.grasps,
             progress=min(1.0, sum(stage.done for stage in job.stages) / tasks) if tasks else 0.0,
@@ -183,7 +184,7 @@ class Jobs:
             stages=stages,
         )
 
-    def _running(self, job_id: str) -> list[TaskView]:
+    def _reported_tasks(self, job_id: str) -> list[TaskView]:
         """Return running tasks, then those of the first waiting tasks that have a reason to wait."""
         tasks = self._services.index.jobs.tasks
         running = tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items
@@ -206,7 +207,7 @@ class TaskRates:
         self._first: OrderedDict[tuple[str, int], tuple[float, float]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def of(self, task: TaskView) -> float | None:
+    def rate_of(self, task: TaskView) -> float | None:
         """Return the share of the task done per second; None while unknown."""
         share = task.done / task.total if task.total else 0.0
         now = self._clock()
@@ -251,7 +252,7 @@ def _status(stage: StageProgress, tasks: list[TaskView], paces: TaskRates) -> St
 
 def _rate(stage: StageProgress, running: list[TaskView], paces: TaskRates) -> float | None:
     """Return tasks per second of the running tasks; if unknown, the mean rate of the finished tasks."""
-    known = [pace for task in running if (pace := paces.of(task)) is not None]
+    known = [pace for task in running if (pace := paces.rate_of(task)) is not None]
     if known:
         return sum(known) * len(running) / len(known)
     if stage.succeeded > stage.reused and stage.seconds > 0:

@@ -41,18 +41,18 @@ class Tags:
     def all(self) -> list[TagView]:
         return self._services.index.tags.all(scope=project_scope())
 
-    def one(self, name: str) -> TagView:
+    def get(self, name: str) -> TagView:
         wanted = self._services.index.tags.id_of(name, scope=project_scope())
         return next(tag for tag in self.all() if tag.id == wanted)
 
-    def of(self, grasps: Collection[Grasp]) -> dict[Grasp, list[str]]:
+    def names_by_grasp(self, grasps: Collection[Grasp]) -> dict[Grasp, list[str]]:
         """Return the names of the tags of the given grasps; grasps without tags are omitted."""
-        return self._services.index.tags.of(grasps, scope=project_scope())
+        return self._services.index.tags.names_by_grasp(grasps, scope=project_scope())
 
-    def chosen(self, selection: Selection) -> list[Grasp]:
+    def resolve_selection(self, selection: Selection) -> list[Grasp]:
         """Return the grasps of a selection, each once; raise NotFoundError if one is out of scope."""
         if selection.filter is not None:
-            return self._grasps.members(selection.filter)
+            return self._grasps.matching_grasps(selection.filter)
         named = sorted({(grasp.shard_id, grasp.row) for grasp in selection.grasps or ()})
         there = self._services.index.tags.existing_grasps(named, scope=project_scope())
         for shard, row in named:
@@ -60,28 +60,30 @@ class Tags:
                 raise NotFoundError(f"there is no grasp {row} in shard {shard!r}")
         return named
 
-    def give(self, name: str, selection: Selection) -> TagChange:
-        if not (grasps := self.chosen(selection)):
+    def tag_grasps(self, name: str, selection: Selection) -> TagChange:
+        if not (grasps := self.resolve_selection(selection)):
             raise InputError("no grasp passes this filter, so none gets the tag")
         project = project_scope().project
 
         def permit(tag: Tag | None) -> None:
-            _permit(tag)
+            _require_tag_ownership(tag)
             if tag is None and self._tag_count(project) >= MOST_TAGS:
                 raise LimitError(f"there are {MOST_TAGS} tags already, the maximum; delete one")
 
         changed = tagging.tag_grasps(self._services, name, grasps, project=project, owner=caller_id(), permit=permit)
         log.info("tag %s given to %d grasps", name, changed)
-        return TagChange(tag=self.one(tag_id(name, project)), changed=changed)
+        return TagChange(tag=self.get(tag_id(name, project)), changed=changed)
 
-    def untag(self, name: str, selection: Selection) -> TagChange:
+    def untag_grasps(self, name: str, selection: Selection) -> TagChange:
         tag = self._services.index.tags.id_of(name, scope=project_scope())
-        changed = tagging.untag_grasps(self._services, tag, self.chosen(selection), permit=_permit)
-        return TagChange(tag=self.one(tag), changed=changed)
+        changed = tagging.untag_grasps(
+            self._services, tag, self.resolve_selection(selection), permit=_require_tag_ownership
+        )
+        return TagChange(tag=self.get(tag), changed=changed)
 
-    def remove(self, name: str) -> None:
+    def delete(self, name: str) -> None:
         tag = self._services.index.tags.id_of(name, scope=project_scope())
-        tagging.delete_tag(self._services, tag, permit=_permit, owner=caller_id())
+        tagging.delete_tag(self._services, tag, permit=_require_tag_ownership, owner=caller_id())
         log.info("tag %s removed", name)
 
     def _tag_count(self, project: str) -> int:
@@ -90,7 +92,7 @@ class Tags:
         return sum(bool(project) or may_change(tag.owner, tag.project) for tag in found)
 
 
-def _permit(tag: Tag | None) -> None:
+def _require_tag_ownership(tag: Tag | None) -> None:
     if tag is not None:
         require_ownership(tag.owner, f"the tag {tag.name!r}", tag.project)
 
@@ -124,7 +126,7 @@ class GraspExports:
         return size, _stream(file)
 
     def _rows(self, places: Sequence[Grasp]) -> Iterator[dict[str, Any]]:
-        tags = self._tags.of(places)
+        tags = self._tags.names_by_grasp(places)
         for grasp in self._grasps.get_many(places):
             yield grasp.model_dump(mode="json") | {"tags": tags.get((grasp.shard_id, grasp.row), [])}
 

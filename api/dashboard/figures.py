@@ -141,10 +141,10 @@ def dataset_grid(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
             made=cell.counted(dataset.options),
             candidates=cell.candidates,
             share=cell.valid_yield,
-            standing=dataset.options.standing,
+            standing=dataset.options.displayed_status,
             progress=cell.progress if cell.state is State.RUNNING else None,
             note=cell.reason or "",
-            scene=dataset.options.place.kind,
+            scene=dataset.options.scene_spec.kind,
         )
         for cell in cells
     }
@@ -234,7 +234,7 @@ def load_stability(store: Store) -> studies.Stability | None:
     """Load the newest published stability maps; None if there are none, or they are unreadable."""
     try:
         found = latest_record(store, STABILITY)
-        return None if found is None else studies.from_json(found)
+        return None if found is None else studies.parse_stability(found)
     except (ValueError, DamagedError):
         return None
 
@@ -249,9 +249,9 @@ def draw_map(one: studies.StabilityMap) -> MapDrawing:
 
 
 def _panel(one: studies.StabilityMap, name: str) -> Panel:
-    cells = one.of(name)
+    cells = one.panel_cells(name)
     xs, ys = ([*dict.fromkeys(getattr(cell, axis) for cell in cells)] for axis in ("x", "y"))
-    squares = {(cell.x, cell.y): _square(one, cell, ringed=one.is_divided and cell.reached) for cell in cells}
+    squares = {(cell.x, cell.y): _square(one, cell, ringed=one.is_partly_reachable and cell.reached) for cell in cells}
     line = one.lines.get(name, [])
     if any(isinstance(x, str) for x in xs):
         # Texts are labels of rows, because columns are narrow.

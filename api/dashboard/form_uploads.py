@@ -21,7 +21,7 @@ from graspd.service.index.views import AssetView
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.assets import asset_json
-from graspd.service.store.descriptions import json_object
+from graspd.service.store.descriptions import parse_json_object
 
 _CHECK_WAIT_S: Final = 15.0
 UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))
@@ -69,7 +69,7 @@ class AssetChoice:
     held: str = ""
     """Digest of the refused file in the store; if empty, the user must choose the file again."""
 
-    def place(self, kind: AssetKind) -> str:
+    def form_field(self, kind: AssetKind) -> str:
         return FILE_FIELDS[kind] if self.file else kind.value
 
 
@@ -140,13 +140,13 @@ def _store(request: Request, assets: Assets, kind: AssetKind, file: UploadFile, 
 
 def _retry_upload(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
     """Store the refused file again, with the options of the pressed button or with changed units."""
-    before, said = assets.one(kind, digest), fix_options(fields, kind)
+    before, said = assets.get(kind, digest), fix_options(fields, kind)
     if not said and kind is AssetKind.OBJECT and (units := _units(fields)) != _text(fields, "held_units"):
         said = {"units": units}
     if not said:
         return before
     files = assets.files(before)
-    stated = json_object(asset_json(files), "asset.json")
+    stated = parse_json_object(asset_json(files), "asset.json")
     for key, value in said.items():
         known = stated.get(key)
         stated[key] = {**known, **value} if isinstance(known, dict) and isinstance(value, dict) else value
@@ -155,7 +155,7 @@ def _retry_upload(assets: Assets, kind: AssetKind, digest: str, fields: FormData
 
 def fix_options(fields: FormData, kind: AssetKind) -> dict[str, Any]:
     """Return the options of the pressed button, with the value of its field in place of null."""
-    said = json_object(text, "the option") if (text := _text(fields, f"{kind.value}_fix")) else {}
+    said = parse_json_object(text, "the option") if (text := _text(fields, f"{kind.value}_fix")) else {}
     for key in [key for key, value in said.items() if value is None and key in _ASKED]:
         label, given = _ASKED[key][0], _text(fields, f"{kind.value}_{key}").strip()
         if not given:
@@ -172,7 +172,7 @@ def _wait_for_check(assets: Assets, asset: AssetView) -> AssetChoice:
     deadline = time.monotonic() + _CHECK_WAIT_S
     while asset.verdict is None and time.monotonic() < deadline:
         time.sleep(0.2)
-        asset = assets.one(asset.kind, asset.digest)
+        asset = assets.get(asset.kind, asset.digest)
     if asset.verdict == "refuse":
         return AssetChoice(refused=refusal_of(asset), file=asset.name, held=asset.digest)
     return AssetChoice(name=asset.name)

@@ -95,7 +95,7 @@ def grasps_page(
 def grasp_page(
     request: Request, shard_id: str, row: int, grasps: GraspsOf, shards: ShardsOf, tags: TagsOf
 ) -> HTMLResponse:
-    grasp, shard = grasps.one(shard_id, row), shards.one(shard_id)
+    grasp, shard = grasps.get(shard_id, row), shards.get(shard_id)
     return render(
         request,
         "grasp.html",
@@ -103,7 +103,7 @@ def grasp_page(
         grasp=grasp,
         did=action_summary(dict(request.query_params)),
         tags=[tag.name for tag in tags.all()],
-        tagged=tags.of([(shard_id, row)]),
+        tagged=tags.names_by_grasp([(shard_id, row)]),
         stops=[point.name for point in grasp.way if point.name],
         shard=shard,
         job=shards.job_of(shard_id),
@@ -115,14 +115,14 @@ def grasp_page(
         type=GraspType(int(grasp.grasp_type or 0)),
         weakest=_WEAKEST.get(grasp.robust_weakest or ""),
         swept=[metric for metric in GRASP_METRICS if metric.name in grasp.sweep],
-        loader=rendering.grasp_loader(grasp, base_url(request)),
+        loader=rendering.grasp_loader_code(grasp, base_url(request)),
     )
 
 
 def tag_choices(
     tags: Tags, rows: Sequence[GraspView], known: Sequence[TagView], where: Mapping[str, str]
 ) -> dict[str, Any]:
-    tagged = tags.of([(grasp.shard_id, grasp.row) for grasp in rows])
+    tagged = tags.names_by_grasp([(grasp.shard_id, grasp.row) for grasp in rows])
     return {"tagged": tagged, "tags": known, "filter": urlencode(where)}
 
 
@@ -185,7 +185,7 @@ def action_summary(given: dict[str, str]) -> str:
 def _tag(tags: Tags, fields: FormData, *, on: bool) -> RedirectResponse:
     name = _validate(_NAME, fields.get("tag"), "tag")
     selection = _selection(fields)
-    change = tags.give(name, selection) if on else tags.untag(name, selection)
+    change = tags.tag_grasps(name, selection) if on else tags.untag_grasps(name, selection)
     said = {"did": "tagged" if on else "untagged", "done": change.changed, "named": name}
     here = str(fields.get("here", ""))
     if _PAGES.fullmatch(here) and here != "/grasps":

@@ -17,7 +17,7 @@ from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf
 from graspd.service.index.views import AssetView
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.states import AssetKind
-from graspd.service.store.asset_summary import hand_line, limit_line, self_test_line
+from graspd.service.store.asset_summary import hand_line, payload_line, self_test_line
 from graspd.service.store.descriptions import MAX_ENTRIES, HandFacts
 
 PAGE_SIZE: Final = 50
@@ -53,7 +53,7 @@ def hands_page(
 
 @router.get("/{name}", dependencies=READ)
 def hand_page(request: Request, name: str, assets: AssetsOf) -> HTMLResponse:
-    hand = assets.one(AssetKind.HAND, name)
+    hand = assets.get(AssetKind.HAND, name)
     facts, trouble = _facts(assets, hand)
     return _page(request, hand, facts, problem=trouble, form=_form_of(facts) if facts else {})
 
@@ -65,7 +65,7 @@ async def correct(request: Request, name: str, assets: AssetsOf) -> HTMLResponse
 
 
 def _correct(request: Request, assets: Assets, name: str, fields: FormData) -> HTMLResponse | RedirectResponse:
-    hand = assets.one(AssetKind.HAND, name)
+    hand = assets.get(AssetKind.HAND, name)
     facts = assets.hand_facts(hand)
     shown = _form_of(facts) | {key: value for key, value in fields.multi_items() if isinstance(value, str)}
     shown["fingertips"] = [str(value) for value in fields.getlist("fingertip")]
@@ -96,7 +96,7 @@ def _page(
         form=form,
         guessed=guessed if isinstance(guessed, list) else [],
         self_test=self_test_line(hand.facts),
-        limit=limit_line(hand.facts),
+        limit=payload_line(hand.facts),
     )
 
 

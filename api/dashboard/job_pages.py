@@ -31,7 +31,7 @@ router = APIRouter(include_in_schema=False)
 
 @router.get("/jobs/{job_id}", dependencies=READ)
 def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags: TagsOf) -> HTMLResponse:
-    job = jobs.one(job_id)
+    job = jobs.get(job_id)
     pictures = _pictures(job)
     shown = {key: (label, unit) for key, label, unit in COLUMNS}
     validated = job.request.validation != "none"
@@ -59,8 +59,8 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         columns=COLUMNS,
         sort="epsilon",
         shards=job.shards,
-        loader=rendering.loader(job, base_url(request)),
-        curl=rendering.curl(job, base_url(request)),
+        loader=rendering.job_loader_code(job, base_url(request)),
+        curl=rendering.curl_commands(job, base_url(request)),
     )
 
 
@@ -76,7 +76,7 @@ def picture(
     channel: Channel = "rgb",
     width: Annotated[int | None, Query(ge=16, le=4096)] = None,
 ) -> Response:
-    shard = shards.one(shard_id)
+    shard = shards.get(shard_id)
     data = request.app.state.pictures.png(shard.key, shard.sha256, index, channel, width)
     return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"})
 
@@ -110,7 +110,7 @@ _CLASSES: Final = np.array(
 )
 
 
-class Pictures:
+class ShardPictures:
     """Decoder of pictures of views shards, with a cache of recent shards."""
 
     def __init__(self, store: Store) -> None:

@@ -32,7 +32,7 @@ from graspd.service.store.store import Store
 T = TypeVar("T")
 
 
-def provide(app: FastAPI, services: Services) -> None:
+def install_services(app: FastAPI, services: Services) -> None:
     """Create the objects that routes depend on, from these services."""
     redis = connect(redis_url(services.settings), patience=1)
     state = app.state
@@ -53,19 +53,19 @@ def provide(app: FastAPI, services: Services) -> None:
     state.grasp_exports = GraspExports(services, state.grasps, state.tags)
 
 
-def may_read(request: Request) -> None:
+def require_read(request: Request) -> None:
     authorize(request, Scope.READ)
 
 
-def may_submit(request: Request) -> None:
+def require_submit(request: Request) -> None:
     authorize(request, Scope.SUBMIT)
 
 
-READ: Final = [Depends(may_read)]
-SUBMIT: Final = [Depends(may_submit)]
+READ: Final = [Depends(require_read)]
+SUBMIT: Final = [Depends(require_submit)]
 
 
-def may_scrape(request: Request) -> None:
+def require_metrics_access(request: Request) -> None:
     """Raise ApiError unless the caller may read, or the settings permit all callers."""
     if request.app.state.settings.metrics_need_key:
         authorize(request, Scope.READ)
@@ -104,7 +104,7 @@ class Paging:
     limit: int
     cursor: str | None
 
-    def linked(self, page: Page[T]) -> Page[T]:
+    def add_next_link(self, page: Page[T]) -> Page[T]:
         """Set the Link header (RFC 8288) to the next page, with the same filters."""
         if page.next is not None:
             self.response.headers["Link"] = f'<{next_address(self.request, page.next)}>; rel="next"'

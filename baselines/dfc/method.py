@@ -68,7 +68,7 @@ class Dfc:
 
         states, energies = zip(*run_parts(split_batch(wanted.count, run), work), strict=True)
         passed = (np.concatenate(energies)[:, :3] < np.array(PASSES)).all(axis=1)
-        return grasp_set(pair, HandState.joined(states), began, {"passed": passed.tolist()})
+        return grasp_set(pair, HandState.concatenate(states), began, {"passed": passed.tolist()})
 
 
 METHOD: Final = Method(
@@ -135,7 +135,7 @@ class Descent:
 
     def __init__(self, pair: Pair, starts: HandState, seeds: list[list[int]]) -> None:
         self.pair, self.n = pair, len(starts.pivot)
-        self.obj = pair.fine.obj.thinned(SAMPLES)
+        self.obj = pair.fine.obj.with_fewer_samples(SAMPLES)
         self.candidates = inner_side_points(pair.hand.model, each=EACH, on_palm=ON_PALM)
         # Model of the proposals; only its kinematics is computed.
         self.model = Model.create(pair.hand, self.obj, pair.coarse.points, pair.coarse.own, pair.options)
@@ -185,7 +185,9 @@ class Descent:
         if self.pairs:
             out.add(kernels.self_penetration, (n, self.pairs), inputs=[*self.keys, *pose], outputs=own)
         add_root_gradient(out, m, s)
-        out.add(kernels.limits, n, inputs=[m.hand.lower, m.hand.upper, s.q], outputs=[self.new_terms, s.gradient])
+        out.add(
+            kernels.limit_violation, n, inputs=[m.hand.lower, m.hand.upper, s.q], outputs=[self.new_terms, s.gradient]
+        )
         kept = [self.rng, self.terms, self.gradient, *present, self.taken]
         out.add(kernels.accept, n, inputs=[s.iteration, self.new_terms, s.gradient, *proposed], outputs=kept)
         out.add(optimizers.advance, 1, inputs=[], outputs=[s.iteration])

@@ -65,7 +65,7 @@ class Search:
         out.origin = wp.array(self.eigen.origin, dtype=wp.float32)
         out.eigen = wp.array(self.eigen.directions, dtype=wp.float32)
         out.lower, out.upper = self.pair.hand.lower, self.pair.hand.upper
-        out.clash = wp.array(clash_grid(self.pair, self.eigen), dtype=wp.int32)
+        out.clash = wp.array(self_collision_grid(self.pair, self.eigen), dtype=wp.int32)
         return out
 
     def run(self, seeds: list[list[int]], *, steps: int, keep: int, tell: StepCounter) -> HandState:
@@ -81,7 +81,9 @@ class Search:
             best = wp.zeros((chains, keep), dtype=kernels.vec8)
             best_energy = wp.full((chains, keep), NOT_YET, dtype=wp.float32)
             scratch = [wp.zeros((chains, self.hand.bodies), dtype=kind) for kind in (wp.vec3, wp.quat)]
-            wp.launch(kernels.begin, chains, inputs=[self.problem, START_TRIES], outputs=[rng, state, energy, *scratch])
+            wp.launch(
+                kernels.draw_start, chains, inputs=[self.problem, START_TRIES], outputs=[rng, state, energy, *scratch]
+            )
             if (energy.numpy() < 0).any():
                 obj = self.pair.fine.obj.model
                 raise InputError(f"{self.hand.name} has no collision-free start around {obj.name}")
@@ -131,7 +133,7 @@ class Graspit:
             state = search.run(seeds, steps=self.options.steps, keep=keep, tell=steps)
             return HandCloser(pair, len(state.pivot)).close(state)
 
-        states = HandState.joined(run_parts(split_batch(chains, run), work))
+        states = HandState.concatenate(run_parts(split_batch(chains, run), work))
         return grasp_set(pair, states[: wanted.count], began, {"chains": chains, "moves": moves})
 
 
@@ -165,7 +167,7 @@ EACH: Final = 2
 ON_PALM: Final = 3
 
 
-def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
+def self_collision_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
     """Return (CLASH_GRID, CLASH_GRID): 1 for a posture whose self-overlap exceeds `CLASH_M`."""
     axes = [np.linspace(low, high, CLASH_GRID) for low, high in eigen.limits]
     amplitudes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -151,7 +151,7 @@ class Replay:
         return bool(self.of_hand[contact.geom].any())
 
     def touches(self, grasp: str) -> bool:
-        """Check whether the open hand penetrates anything deeper than `allowed` on its approach."""
+        """Check whether the open hand penetrates anything deeper than `allowed_depth` on its approach."""
         for a, b, looks in (("standoff", "arrival", WAY_LOOKS), ("arrival", "pregrasp", CLOSING_LOOKS)):
             first, last = self.key(grasp, a), self.key(grasp, b)
             for look in range(looks):
@@ -167,11 +167,11 @@ class Replay:
                     self.watch(self)
                 for contact in self.data.contact:
                     ours = self.of_hand[contact.geom]
-                    if ours.any() and not ours.all() and contact.dist < -self.allowed(contact.geom):
+                    if ours.any() and not ours.all() and contact.dist < -self.allowed_depth(contact.geom):
                         return True
         return False
 
-    def allowed(self, pair: Any) -> float:
+    def allowed_depth(self, pair: Any) -> float:
         """Return the allowed depth of a pair of geoms in the approach [m]; some supports allow fingertips."""
         if self.of_object[pair].any():
             return OVERHANG_M

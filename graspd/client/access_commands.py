@@ -47,7 +47,7 @@ def add_key(
         grasps_in_flight=grasps_in_flight,
         jobs_per_day=jobs_per_day,
     )
-    lifetime = duration(expires) if expires else None
+    lifetime = parse_duration(expires) if expires else None
     token = _key_file().add(name, scope, lifetime=lifetime, limits=limits, project=project)
     _show_token(name, scope, token, json=json)
 
@@ -61,7 +61,7 @@ def rotate_key(
 ) -> None:
     """Replace the secret of a key and show it once; scope, project and limits do not change."""
     keys = _key_file()
-    token = keys.rotate(name, grace=duration(grace), lifetime=duration(expires) if expires else None)
+    token = keys.rotate(name, grace=parse_duration(grace), lifetime=parse_duration(expires) if expires else None)
     _show_token(name, next(key.scope for key in reversed(keys.list()) if key.name == name), token, json=json)
 
 
@@ -112,7 +112,7 @@ def revoke_key(name: NameArgument, json: JsonFlag = False) -> None:
     print_result({"name": name, "revoked": True}, f"the key {name} is revoked", json=json)
 
 
-def duration(text: str) -> timedelta:
+def parse_duration(text: str) -> timedelta:
     """Parse a time such as 90d, 12h, 30m or 45s; raise InputError for any other text."""
     match = re.fullmatch(r"(\d{1,6})([smhd])", text.strip())
     if match is None:

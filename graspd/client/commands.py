@@ -27,7 +27,7 @@ from graspd.client.reports import (
     watch,
 )
 from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
-from graspd.service.command_options import parse_pairs, parsed_options, with_options
+from graspd.service.command_options import parse_pairs, validate_options, with_options
 from graspd.service.model.domain import NETWORK_METHODS, JobOptions, JobRequest
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import scene_option
@@ -62,7 +62,7 @@ def submit(
             "scene": scene_option(options.get("scene", "free"), named=object_name),
             "neighbours": [object_name(one) for one in options.get("neighbours", ())],
         }
-        request = parsed_options(JobRequest, options)
+        request = validate_options(JobRequest, options)
         job = client.submit(request)
         if wait:
             job = watch(client, job.id)
@@ -261,7 +261,7 @@ def _asset_name(client: Client, kind: AssetKind, value: str) -> str:
     if not path.is_file():
         raise InputError(f"there is no file {value}; give a path that exists, or the name of a known {kind.value}")
     asset = client.upload(kind, path, name=name_of_upload(path.name))
-    if not asset.builtin and (asset := client.wait_checked(kind, asset.digest)).verdict == "refuse":
+    if not asset.builtin and (asset := client.wait_for_check(kind, asset.digest)).verdict == "refuse":
         raise InputError(f"refused: {asset.message}")
     return asset.name
 

@@ -224,7 +224,7 @@ class JobDisplay:
 
     def _draw(self, stage: StageStatus, job: Job) -> None:
         if stage.stage not in self._bars:
-            made, unit = _size_of(stage, job)
+            made, unit = _stage_items(stage, job)
             self._bars[stage.stage] = self._progress.add_task(
                 stage.stage.value,
                 total=stage.tasks,
@@ -248,7 +248,7 @@ class JobDisplay:
         self._console.print(self._line(stage, job, now))
 
     def _line(self, stage: StageStatus, job: Job, now: float) -> str:
-        elapsed, (made, unit) = now - self._started.get(stage.stage, now), _size_of(stage, job)
+        elapsed, (made, unit) = now - self._started.get(stage.stage, now), _stage_items(stage, job)
         words = f"{stage.stage.value:<11} {stage.state.value:<10} {100 * stage.progress:3.0f} %"
         if stage.state is State.SUCCEEDED:
             seconds = stage.seconds or elapsed
@@ -259,7 +259,7 @@ class JobDisplay:
         return words
 
 
-def _size_of(stage: StageStatus, job: Job) -> tuple[int, str]:
+def _stage_items(stage: StageStatus, job: Job) -> tuple[int, str]:
     """Return the number of items that a stage makes, and their name."""
     return (job.requested, "grasps") if stage.stage is Stage.SYNTHESIZE else (stage.tasks, "tasks")
 
@@ -306,7 +306,8 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
     console.print(f"cells: {states}")
     candidates = f" of {count(dataset.candidates)} candidates ({_yield(dataset)})" if dataset.candidates else ""
     console.print(
-        f"grasps: {count(dataset.counted)} {dataset.options.standing}{candidates}, {count(dataset.asked)} requested; "
+        f"grasps: {count(dataset.counted)} {dataset.options.displayed_status}{candidates}, "
+        f"{count(dataset.asked)} requested; "
         f"{count(dataset.shards)} shards, {size(dataset.size_bytes)}; worker time {duration(dataset.seconds)}",
         soft_wrap=True,
     )
@@ -347,7 +348,7 @@ def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
         said = -1.0
         for dataset in client.watch_dataset(name):
             pace = metric(dataset.counted / dataset.seconds) if dataset.seconds else None
-            rate = f"{pace} {dataset.options.standing}/s per worker" if pace is not None else ""
+            rate = f"{pace} {dataset.options.displayed_status}/s per worker" if pace is not None else ""
             left = f"{duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
             progress.update(bar, completed=dataset.progress, rate=rate, left=left)
             if not console.is_terminal and dataset.progress - said >= 0.05:

@@ -120,7 +120,7 @@ def _report(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
         if whole.get("robust_share") is not None:
             typer.echo(_format_robustness(whole))
         if "foreign_held" in whole:
-            typer.echo(_foreign(whole, foreign))
+            typer.echo(_format_second_model(whole, foreign))
         for row in rows:
             if "note" in row:
                 typer.echo(row["note"], err=True)
@@ -187,7 +187,7 @@ def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:
     return table
 
 
-def _foreign(whole: dict[str, Any], name: str) -> str:
+def _format_second_model(whole: dict[str, Any], name: str) -> str:
     held = whole["foreign_held"]
     share = _cell(whole["foreign_share"], 2)
     return (

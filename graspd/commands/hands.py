@@ -15,7 +15,7 @@ from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
 from graspd.service.command_options import with_options
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.states import AssetKind
-from graspd.service.store.asset_options import HandWords, hand_options
+from graspd.service.store.asset_options import HandCommandOptions, hand_options
 from graspd.service.store.asset_summary import print_check, self_test_lines
 from graspd.service.store.descriptions import description_of
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
@@ -28,7 +28,7 @@ app = CommandGroup(add_completion=False)
 
 
 @app.command("check", epilog="graspd hands check my_hand.urdf --palm base_link --approach 0,0,1 --picture my_hand.png")
-@with_options(HandWords, "asset")
+@with_options(HandCommandOptions, "asset")
 def check(
     file: Annotated[str, typer.Argument(help="URDF, xacro or MJCF file, its folder or ZIP, or a built-in hand.")],
     options: dict[str, Any],

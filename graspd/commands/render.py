@@ -20,9 +20,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from graspd.commands.grasp_sheet import GraspAnimation, GraspSheet, Kind
 from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_result, write_output
 from graspd.service.model.errors import InputError
-from graspd.service.model.scene_spec import supports_in
+from graspd.service.model.scene_spec import scene_supports
 from graspd.service.model.transforms import compose
-from graspd.service.readers.trajectories import scene_spec_of, wrists_of
+from graspd.service.readers.trajectories import scene_spec_of, wrist_angles
 from graspd.service.store import validity
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.engines.devices import Device
@@ -85,7 +85,7 @@ def render(
         cameras=given,
         neighbours=neighbours_of_shard(scene, with_ or []),
         drawn=_best_grasps(scene, hand) if scene.kind == "base" else _hand_in_pictures(scene, with_hand, hand),
-        supports=TABLE if spec is None else supports_in(spec),
+        supports=TABLE if spec is None else scene_supports(spec),
     )
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
@@ -157,7 +157,7 @@ def pictures(
     models = (hand_of_shard(base, hand), object_of_shard(base, object), rows)
     run = ExecutionContext(Device(device).resolve())
     if animate:
-        page = GraspAnimation(base, *models, run, size).file(output.suffix)
+        page = GraspAnimation(base, *models, run, size).encode(output.suffix)
     else:
         kind: Kind = "trajectory" if trajectory else "three sides" if three else "one side"
         subtitle = f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}"
@@ -193,7 +193,7 @@ def _best_grasps(base: Shard, hand: str | None) -> DrawnHand | None:
         return None
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     placed = compose(np.asarray(base["scene/object_pose"], float), poses)
-    return DrawnHand(hand_of_shard(base, hand), rows, placed, joints, wrists_of(base, rows))
+    return DrawnHand(hand_of_shard(base, hand), rows, placed, joints, wrist_angles(base, rows))
 
 
 def _hand_in_pictures(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
@@ -209,7 +209,7 @@ def _hand_in_pictures(scene: Shard, base_file: Path | None, hand: str | None) ->
     rows = best_transferred_rows(scene.arrays, base.arrays)
     joints = np.asarray(base["grasp/joint_positions"], float)[source[rows]]
     poses = np.asarray(scene["grasp/hand_pose"], float)[rows]
-    return DrawnHand(model, rows, poses, joints, wrists_of(scene, rows))
+    return DrawnHand(model, rows, poses, joints, wrist_angles(scene, rows))
 
 
 @app.command(epilog="graspd view grasps.h5")

@@ -21,7 +21,7 @@ from graspd.service.model.fidelity import FIDELITIES, OFFERED, Fidelity
 from graspd.service.model.metrics import ROBUST_MODELS
 from graspd.service.model.renamed import convert_chart
 from graspd.service.model.scene_spec import SceneSpec, parse_scene
-from graspd.service.model.studies import Stability, from_json
+from graspd.service.model.studies import Stability, parse_stability
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.store.records import STABILITY, chart_kind, publish_record
 from graspd.service.store.store import open_store
@@ -111,15 +111,15 @@ def stability(
     if unknown := [name for name in only or [] if name not in STUDIES]:
         raise InputError(f"there is no study {unknown[0]!r}; choose one of {choices_text(unknown[0], STUDIES)}")
     if source:
-        found = _merge([_read(path, "stability", from_json) for path in source])
+        found = _merge([_read(path, "stability", parse_stability) for path in source])
         found = replace(found, maps=[one for one in found.maps if not only or one.name in only])
     else:
         found = _measure(tuple(only or STUDIES), hand, object_, quick=quick, long=long, threads=threads)
     if out is not None:
         write(found, out)
     key = _publish(STABILITY, found.as_json(), data_dir) if publish else None
-    good = {one.name: {panel: one.share(panel) for panel in one.panels} for one in found.maps}
-    still = {one.name: one.still_breaks() for one in found.maps}
+    good = {one.name: {panel: one.good_share(panel) for panel in one.panels} for one in found.maps}
+    still = {one.name: one.broken_cell_lines() for one in found.maps}
     told = {"good": good, "still_breaks": still, "out": None if out is None else str(out), "published": key}
     print_result(told, markdown(found), json=json)
 
@@ -130,9 +130,9 @@ def _measure(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: 
     backend.start_warp()
     import warp as wp
 
-    from graspd.studies.stability.studies import run
+    from graspd.studies.stability.studies import run_studies
 
-    maps = run(names, hand, obj, quick=quick, long=long, work=ExecutionContext(threads=threads), say=_echo)
+    maps = run_studies(names, hand, obj, quick=quick, long=long, work=ExecutionContext(threads=threads), say=_echo)
     command = shlex.join(["graspd", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])
     return Stability(timestamp(), command, {"graspd": PACKAGE_VERSION, "warp": wp.__version__}, maps)
 
@@ -206,9 +206,9 @@ def chart(
     knob_values(knobs=knob or ())  # Report a wrong name before an hour of work.
     if scene != "free" and sweep:
         raise InputError("--sweep is for charts of free objects; omit --scene")
-    place = _place(scene)
+    place = _chart_scene(scene)
     on = ExecutionContext(Device(device).resolve(), threads)
-    batches, models_around = [_number(part) for part in _parts(batch)], ROBUST_MODELS
+    batches, models_around = [_parse_batch(part) for part in _parts(batch)], ROBUST_MODELS
     if quick:
         hands, objects, fidelities = (_parts(text)[0] for text in (hands, objects, fidelities))
         batches, baseline_batch, repeats, models_around = [4], 2, 1, 2
@@ -261,7 +261,7 @@ def _read_chart(path: Path) -> dict[str, Any]:
     return found
 
 
-def _place(scene: str) -> SceneSpec | None:
+def _chart_scene(scene: str) -> SceneSpec | None:
     if scene == "free":
         return None
     spec = parse_scene(scene)
@@ -289,7 +289,7 @@ def _parts(text: str) -> list[str]:
     return parts
 
 
-def _number(text: str) -> int:
+def _parse_batch(text: str) -> int:
     if not text.isdigit() or not 1 <= int(text) <= 4096:
         raise InputError(f"--batch {text!r} is no number of grasps from 1 to 4096")
     return int(text)
@@ -297,11 +297,11 @@ def _number(text: str) -> int:
 
 def _chart_objects(objects: Sequence[str]) -> list[Any]:
     from graspd.studies.chart.chart import ChartObject
-    from graspd.worker.objects.prepare import name_of, object_from_path
+    from graspd.worker.objects.prepare import object_from_path, object_name
 
     def load(text: str, error: float) -> Any:
         return object_from_path(text, face_error_m=error)
 
     for text in objects:
         load(text, 1e-3)  # Report a wrong file before an hour of work.
-    return [ChartObject(name_of(Path(text)), partial(load, text)) for text in objects]
+    return [ChartObject(object_name(Path(text)), partial(load, text)) for text in objects]

@@ -122,7 +122,7 @@ class Database:
         with self.read_transaction(within) as connection:
             return connection.execute(query).mappings().all()
 
-    def one(self, query: Select[Any], what: str, within: Connection | None = None) -> RowMapping:
+    def first_row(self, query: Select[Any], what: str, within: Connection | None = None) -> RowMapping:
         """Return the first row; NotFoundError `there is no {what}` if there is none."""
         if not (found := self.rows(query, within)):
             raise NotFoundError(f"there is no {what}")

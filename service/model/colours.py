@@ -5,7 +5,7 @@ from __future__ import annotations
 Colour = tuple[float, float, float]
 
 
-def linear(red: float, green: float, blue: float) -> Colour:
+def linear_rgb(red: float, green: float, blue: float) -> Colour:
     """Convert sRGB components in 0..1 to linear RGB (IEC 61966-2-1)."""
 
     def one(c: float) -> float:
@@ -14,7 +14,7 @@ def linear(red: float, green: float, blue: float) -> Colour:
     return one(red), one(green), one(blue)
 
 
-def hexadecimal(code: str) -> Colour:
+def linear_rgb_from_hex(code: str) -> Colour:
     """Convert a colour such as `#c8553d` to linear RGB."""
     digits = code.lstrip("#")
-    return linear(*(int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)))
+    return linear_rgb(*(int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)))

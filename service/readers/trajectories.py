@@ -61,7 +61,7 @@ def slider_positions(way: Sequence[Waypoint]) -> Floats:
     return np.interp(np.arange(len(way)), stops, np.arange(len(stops)))
 
 
-def point_at(way: Sequence[Waypoint], place: float) -> Waypoint:
+def waypoint_at(way: Sequence[Waypoint], place: float) -> Waypoint:
     """Interpolate the posture at a slider position: linear for positions and joints, slerp for rotations."""
     places = slider_positions(way)
     place = float(np.clip(place, places[0], places[-1]))
@@ -78,7 +78,7 @@ def point_at(way: Sequence[Waypoint], place: float) -> Waypoint:
     return Waypoint(name, pose, mix(a.joint_positions, b.joint_positions), mix(a.carried, b.carried))
 
 
-def wrists_of(shard: Shard, rows: NDArray[np.integer[Any]]) -> Floats | None:
+def wrist_angles(shard: Shard, rows: NDArray[np.integer[Any]]) -> Floats | None:
     """Return the angles (N, U) of wrist joints above the hand's root [rad]; None if the shard has none."""
     angles = shard.arrays.get("grasp/wrist_positions")
     return None if angles is None else np.asarray(angles, float)[rows]

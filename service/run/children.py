@@ -91,7 +91,7 @@ class Child:
         elif now >= self._not_before:
             self.start()
 
-    def ask_to_stop(self) -> None:
+    def terminate(self) -> None:
         if self.process is not None and self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
 
@@ -125,7 +125,7 @@ def keep_alive(children: Sequence[Child], stop: threading.Event) -> None:
 def stop_children(children: Sequence[Child], grace_s: float) -> None:
     """Ask all children to stop; kill those that still run after the grace time [s]."""
     for child in children:
-        child.ask_to_stop()
+        child.terminate()
     deadline = time.monotonic() + grace_s
     for child in children:
         child.join(deadline)

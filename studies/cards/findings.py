@@ -31,7 +31,7 @@ _UNMIXED: Final = {
 
 def findings(card: Row) -> list[str]:
     """Return the findings of a card's content as sentences in Markdown, with figures."""
-    parts = (_gaps, _yields, _balance, _rechecks, _table, _directions, _joints, _qualities, _mixed, _unknown)
+    parts = (_gaps, _yields, _balance, _rechecks, _table, _directions, _joints, _qualities, _mixed, _missing_licences)
     return [line for part in parts for line in part(card)]
 
 
@@ -203,7 +203,7 @@ def _mixed(card: Row) -> Iterator[str]:
         yield f"**Mixed fidelities**: {', '.join(str(knobs.get('name')) for knobs in making['fidelities'])}."
 
 
-def _unknown(card: Row) -> Iterator[str]:
+def _missing_licences(card: Row) -> Iterator[str]:
     for what in ("hands", "objects"):
         nameless = [asset["name"] for asset in card["composition"][what] if not asset["licence"]]
         if nameless:

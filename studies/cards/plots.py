@@ -53,7 +53,7 @@ def _names(card: Row, what: str) -> list[str]:
     return [asset["name"] for asset in card["composition"][what]]
 
 
-def _plain(axes: Any) -> None:
+def _style_axes(axes: Any) -> None:
     axes.grid(alpha=0.25)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -104,7 +104,7 @@ def _qualities(card: Row, tally: Tally) -> Any:
                 axes.hist(np.minimum(values, top), bins, weights=weights, label=hand, **style)
         axes.set_xlabel(f"{title} (last bin: all above)" if cut else title, fontsize=9)
         axes.tick_params(labelsize=8)
-        _plain(axes)
+        _style_axes(axes)
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     figure.supylabel("% of the hand's valid grasps", fontsize=9)
@@ -151,7 +151,7 @@ def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) ->
     axes.stairs(even, edges, color=INK, linestyle="--", linewidth=1, label="uniform directions")
     axes.set_xticks([-90, -45, 0, 45, 90], ["below", "-45°", "side", "45°", "above"], fontsize=8)
     axes.tick_params(labelsize=8)
-    _plain(axes)
+    _style_axes(axes)
     if first:
         axes.set_ylabel("pairs of grasp and scene", fontsize=9)
         axes.figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=8)
@@ -174,7 +174,7 @@ def _table(card: Row, tally: Tally) -> Any:
     axes.set_yticks(range(len(order)) if named else [], order if named else [], fontsize=8)
     axes.set_xlim(-0.02 * axes.get_xlim()[1], None)
     axes.set_xlabel("% of the valid grasps that are clear in at least one scene", fontsize=9)
-    _plain(axes)
+    _style_axes(axes)
     figure.legend(loc="outside upper right", ncols=8, frameon=False)
     return figure
 
@@ -220,7 +220,7 @@ def _sizes(card: Row, tally: Tally) -> Any:
         axes.set_xlabel(f"{what} extent of the object, mm", fontsize=9)
         axes.tick_params(labelsize=8)
         axes.set(xlim=(0, None), ylim=(0, 103))
-        _plain(axes)
+        _style_axes(axes)
     panels[0].set_ylabel("valid share of validated grasps, %", fontsize=9)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, frameon=False)
     return figure

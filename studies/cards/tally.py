@@ -18,7 +18,7 @@ from graspd.service.store import validity
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
 from graspd.studies.cards.contents import AssetFacts, Contents, Pair, ShardContents
 from graspd.worker.grasps import Posture
-from graspd.worker.quality.diversity import cells_of
+from graspd.worker.quality.diversity import direction_cells
 
 BINS: Final = 200  # number of bins between a joint's limits
 
@@ -105,7 +105,7 @@ class CellTally:
                 out.columns.setdefault(name, []).extend(parts)
         return out
 
-    def pack(self) -> None:
+    def merge_arrays(self) -> None:
         """Merge the arrays of many shards, because thousands of small arrays need ten times the memory."""
         every: list[list[Any]] = [*self.columns.values(), self.towards, self.prints]
         for parts in every:
@@ -162,7 +162,7 @@ def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
         if (pair, piece.file.batch) != batch_now:
             batch_now, valid = (pair, piece.file.batch), {}
         cell = tally.cells.setdefault(pair, CellTally())
-        _note(tally, cell, piece)
+        _add_metadata(tally, cell, piece)
         hand = contents.hands.get(piece.file.hand, AssetFacts(piece.file.hand))
         if piece.file.kind == "base":
             valid[piece.file.id] = _add_base(tally, cell, piece, hand)
@@ -173,7 +173,7 @@ def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
     return tally
 
 
-def _note(tally: Tally, cell: CellTally, piece: ShardContents) -> None:
+def _add_metadata(tally: Tally, cell: CellTally, piece: ShardContents) -> None:
     kind = piece.file.kind
     tally.shards[kind] += 1
     tally.bytes[kind] += piece.size_bytes
@@ -217,7 +217,7 @@ def _add_base(tally: Tally, cell: CellTally, piece: ShardContents, hand: AssetFa
             kept = (values[:, at] if metric.swept else values)[valid].astype(np.float32)
             cell.columns.setdefault(metric.name, []).append(kept)
     _add_postures(tally, cell, piece, hand, valid)
-    cell.pack()
+    cell.merge_arrays()
     return valid
 
 
@@ -267,7 +267,7 @@ ELEVATION_BINS: Final = 36  # number of bins of elevations from -90 to 90 degree
 
 def cell_counts(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
     """Return (bands, sectors) counts of unit vectors (N, 3), from the lowest band and azimuth -180 degrees on."""
-    cells = cells_of(np.asarray(directions).reshape(-1, 3), bands, sectors)
+    cells = direction_cells(np.asarray(directions).reshape(-1, 3), bands, sectors)
     return np.bincount(cells, minlength=bands * sectors).reshape(bands, sectors)
 
 

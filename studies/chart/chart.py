@@ -15,7 +15,7 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.studies.bench import device_name
 from graspd.studies.chart.statistics import rounded_json_value, run_figures, summarise_runs
-from graspd.studies.chart.trials import FRICTION, Rollout, Setting
+from graspd.studies.chart.trials import FRICTION, Setting, SettingRuns
 from graspd.studies.evaluation import THRESHOLD_M
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
@@ -55,7 +55,7 @@ def chart(
         for hand in hands:
             true = thing.load(TRUE_ERROR_M)
             pieces = decompose(true)
-            cells = [Rollout(s, hand, thing.load(s.knobs.face_error_m), true, pieces) for s in settings]
+            cells = [SettingRuns(s, hand, thing.load(s.knobs.face_error_m), true, pieces) for s in settings]
             for cell in cells:
                 cell.warm_up()
             for _ in range(repeats):
@@ -87,7 +87,7 @@ def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting], models:
     }
 
 
-def _row(cell: Rollout, hand: HandModel, thing: ChartObject) -> dict[str, Any]:
+def _row(cell: SettingRuns, hand: HandModel, thing: ChartObject) -> dict[str, Any]:
     setting = cell.setting
     names = {"method": setting.method, "fidelity": setting.fidelity, "hand": hand.name, "object": thing.name}
     best = {key: rounded_json_value(value) for key, value in cell.best().items()}
@@ -120,8 +120,8 @@ def settings_of(
     """Return a setting for each fidelity and batch of each method, and one for a method without fidelities.
     The latter has `batches[0]` grasps per call, or `baseline_batch` if it has an option `steps`, because such grasps
     take seconds each. Raises InputError: a method or an option is unknown."""
-    variants = [_variant(text) for text in methods]
-    given = _options_of(options, [name for name, _, _ in variants])
+    variants = [_parse_method(text) for text in methods]
+    given = _parse_options(options, [name for name, _, _ in variants])
     found: list[Setting] = []
     for name, changes, size_given in variants:
         known = method(name)
@@ -137,7 +137,7 @@ def settings_of(
     return found
 
 
-def _variant(text: str) -> tuple[str, dict[str, str], int | None]:
+def _parse_method(text: str) -> tuple[str, dict[str, str], int | None]:
     """Parse a method such as `graspit:keep=20@40` into name, options and grasps per call."""
     found = _VARIANT.fullmatch(text)
     if found is None:
@@ -147,7 +147,7 @@ def _variant(text: str) -> tuple[str, dict[str, str], int | None]:
     return name, changes, int(size) if size else None
 
 
-def _options_of(texts: Sequence[str], methods: Sequence[str]) -> Mapping[str, dict[str, str]]:
+def _parse_options(texts: Sequence[str], methods: Sequence[str]) -> Mapping[str, dict[str, str]]:
     found: dict[str, dict[str, str]] = {}
     for text in texts:
         name, colon, rest = text.partition(":")

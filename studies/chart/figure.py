@@ -61,7 +61,7 @@ def draw(rows: Rows, files: Sequence[Path]) -> None:
     styles, words = _styles(rows), "valid grasps per second, end to end"
     labels = []
     for axes, (title, key) in zip(panels.flat[:5], PANELS, strict=True):
-        labels += _over_speed(axes, rows, styles, key, title, words)
+        labels += _draw_over_speed(axes, rows, styles, key, title, words)
     last, timed = panels.flat[5], [row for row in rows if row["seconds_to_first_valid"]]
     labels += _panel(last, timed, styles, x="seconds_to_first_valid", y="dexgraspbench")
     last.set(xlabel="seconds to the first valid grasp, end to end (less is better)", ylim=(-0.07, 1.04))
@@ -81,7 +81,7 @@ def draw_hands(
     styles = _styles([row for rows in by_hand.values() for row in rows])
     labels = []
     for axes, (hand, rows) in zip(panels.flat, by_hand.items(), strict=False):
-        labels += _over_speed(axes, rows, styles, key, hand, words[1], label)
+        labels += _draw_over_speed(axes, rows, styles, key, hand, words[1], label)
     for axes in panels.flat[len(by_hand) :]:
         axes.set_visible(False)
     figure.supylabel(words[0], fontsize=10)
@@ -95,7 +95,7 @@ def _save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
         figure.savefig(file, dpi=150)
 
 
-def _over_speed(
+def _draw_over_speed(
     axes: Any, rows: Rows, styles: Styles, key: str, title: str, words: str, label: PointLabel | None = None
 ) -> list[Label]:
     """Plot one accuracy over the speed, with the Pareto front; return the labels of the points."""
@@ -119,7 +119,7 @@ def draw_scenes(rows: Rows, files: Sequence[Path], *, second: str) -> None:
     words = f"lifted grasps per {second}, end to end"
     labels = []
     for axes, (title, key) in zip(panels.flat[:4], IN_SCENES, strict=True):
-        labels += _over_speed(axes, rows, styles, key, title, words, fidelity_label)
+        labels += _draw_over_speed(axes, rows, styles, key, title, words, fidelity_label)
     timed = [row for row in rows if row["seconds_to_first"]]
     last = panels.flat[4]
     labels += _panel(last, timed, styles, x="seconds_to_first", y="lift", label=fidelity_label)
@@ -285,7 +285,7 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
         before = dict(chosen)
         for index in worded:
             solid = np.vstack([markers, *(offered[other][chosen[other]] for other in worded if other != index)])
-            costs = [_COVERED * _share(box, solid) for box in offered[index]]
+            costs = [_COVERED * _covered_share(box, solid) for box in offered[index]]
             chosen[index] = int(np.argmin(np.array(costs) + fixed[index]))
         if chosen == before:
             break
@@ -301,8 +301,8 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
 def _fixed_costs(boxes: Sequence[Boxes], points: Boxes, own: int, bars: Boxes, inside: Boxes) -> Boxes:
     return np.array(
         [
-            _CROSSED * _share(box, bars)
-            + _OUTSIDE * (1.0 - _share(box, inside[None]))
+            _CROSSED * _covered_share(box, bars)
+            + _OUTSIDE * (1.0 - _covered_share(box, inside[None]))
             + _FARTHER * (at // len(_TURNS))
             + _TURNED * (at % len(_TURNS))
             + _TAKEN * _is_nearer_to_another(box, points, own)
@@ -366,7 +366,7 @@ def _bars(axes: Any, labels: Sequence[Label], half: float) -> Boxes:
     return np.hstack([corners[:, :2] - half, corners[:, 2:] + half])
 
 
-def _share(box: Boxes, boxes: Boxes) -> float:
+def _covered_share(box: Boxes, boxes: Boxes) -> float:
     """Return the covered share of a box's area; overlaps count for each covering box."""
     if not len(boxes):
         return 0.0

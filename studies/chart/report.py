@@ -234,11 +234,17 @@ def with_mode_name(row: Row) -> dict[str, Any]:
 
 
 def _scene_page(chart: Row) -> str:
-    parts = [_scene_head(chart), "![Speed against lifts](chart.png)", _summary(chart["summary"], time_unit(chart))]
+    parts = [
+        _scene_head(chart),
+        "![Speed against lifts](chart.png)",
+        _scene_summary_table(chart["summary"], time_unit(chart)),
+    ]
     if len(chart["by_hand"]) > 1:
         parts += ["## Each hand", "![Lifted over speed](chart.hands.png)"]
-        parts += [f"### {hand}\n\n{_summary(rows, time_unit(chart))}" for hand, rows in chart["by_hand"].items()]
-    parts += ["## Each hand and object", _runs(chart["runs"], time_unit(chart))]
+        parts += [
+            f"### {hand}\n\n{_scene_summary_table(rows, time_unit(chart))}" for hand, rows in chart["by_hand"].items()
+        ]
+    parts += ["## Each hand and object", _scene_runs_table(chart["runs"], time_unit(chart))]
     if refused := [run for run in chart["runs"] if run["note"]]:
         lines = [f"- {r['method']} {r['fidelity']}, {r['hand']}, {r['object']}: {r['note']}" for r in refused]
         parts += ["## Refused", "\n".join(lines)]
@@ -265,7 +271,7 @@ def _scene_head(chart: Row) -> str:
     )
 
 
-def _summary(rows: Sequence[Row], second: str) -> str:
+def _scene_summary_table(rows: Sequence[Row], second: str) -> str:
     lines = [
         "| mode | method | fidelity | candidates | clear | lifted | dexgraspbench | half friction | robust | "
         f"lifted per {second} | planner only | {second}s to the first lift | pairs with a lift | × filtered |",
@@ -289,7 +295,7 @@ def _bold(row: Row, key: str) -> str:
     return f"**{_format(row[key])}**" if key in row["front"] else _format(row[key])
 
 
-def _runs(runs: Sequence[Row], second: str) -> str:
+def _scene_runs_table(runs: Sequence[Row], second: str) -> str:
     lines = [
         "| hand | object | mode | method | fidelity | candidates | clear | lifted | dexgraspbench | half friction | "
         f"robust | lifted per {second} |",

@@ -35,7 +35,7 @@ BOUNDS: Final = "weak: below 0.5; broken: 0, or a value that is not finite"
 SHOWS: Final = "few or no valid grasps; the job reports that its budget is used up"
 
 
-def sheet(thickness_mm: float) -> Any:
+def plate_mesh(thickness_mm: float) -> Any:
     """Return a plate of 80 x 60 mm."""
     return trimesh.creation.box((0.08, 0.06, thickness_mm * MILLIMETRES))
 
@@ -48,13 +48,13 @@ def wedge(angle_deg: float) -> Any:
     return trimesh.convex.convex_hull(np.concatenate(ends))
 
 
-def tunnel(diameter_mm: float) -> Any:
+def ring_mesh(diameter_mm: float) -> Any:
     """Return a thick ring: a wall of 15 mm around a hole of the given diameter."""
     inner = diameter_mm * MILLIMETRES / 2
     return trimesh.creation.annulus(inner, inner + 0.015, 0.05, sections=48)
 
 
-def corner(depth_mm: float) -> Any:
+def cross_mesh(depth_mm: float) -> Any:
     """Return a cross of two bars, with four concave corners of the given depth."""
     deep = depth_mm * MILLIMETRES
     arms = [trimesh.creation.box((0.03 + 2 * deep, 0.03, 0.05)), trimesh.creation.box((0.03, 0.03 + 2 * deep, 0.05))]
@@ -78,10 +78,10 @@ def box_with_defect(name: str) -> Any:
 
 #: Family -> unit of its parameter, constructor, parameters.
 FAMILIES: Final[dict[str, tuple[str, Callable[[float], Any], tuple[float, ...]]]] = {
-    "plate": ("thickness [mm]", sheet, (0.2, 0.5, 1, 2, 5, 10)),
+    "plate": ("thickness [mm]", plate_mesh, (0.2, 0.5, 1, 2, 5, 10)),
     "wedge": ("angle of the edge [deg]", wedge, (5, 10, 20, 40, 80)),
-    "ring": ("diameter of the hole [mm]", tunnel, (4, 8, 16, 32, 64)),
-    "cross": ("depth of the corners [mm]", corner, (2, 5, 10, 20)),
+    "ring": ("diameter of the hole [mm]", ring_mesh, (4, 8, 16, 32, 64)),
+    "cross": ("depth of the corners [mm]", cross_mesh, (2, 5, 10, 20)),
     "cube": ("side [mm]", cube, (1, 3, 10, 30, 60, 100, 200, 500, 1000)),
 }
 _ALLOW_OPEN: Final = "a side is missing, --allow-open"
@@ -149,7 +149,7 @@ def shape_cell(
     """Return the share of valid candidates of a hand on a mesh in metres; `asked` is the job's fidelity or method."""
     request = JobRequest(hand="hand", object="shape", grasps=options.count, want="candidates", rechecks=0, **asked)
     try:
-        obj = prepare_mesh(mesh, request.knobs.face_error_m, allow_open=allow_open)
+        obj = prepare_mesh(mesh, request.resolved_fidelity.face_error_m, allow_open=allow_open)
         found = validated_grasps(hand, obj, request, count=options.count, run=options.run)
     except GraspdError as error:
         return refused_cell(*place, error)

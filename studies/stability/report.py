@@ -52,7 +52,7 @@ def markdown(found: Stability) -> str:
         lines += [f"## {one.title}", "", f"![{one.title}](stability-{one.name}.png)", ""]
         lines += [f"Value of a cell: {one.measure}. {one.bounds[0].upper()}{one.bounds[1:]}.", ""]
         lines += ["| panel | good | weak | broken | refused |", "| --- | --: | --: | --: | --: |"]
-        lines += [f"| {panel} | {_row(one.of(panel))} |" for panel in one.panels]
+        lines += [f"| {panel} | {_row(one.panel_cells(panel))} |" for panel in one.panels]
         lines += ["", f"- symptom: {one.shows}", f"- guard: {one.guard}"]
         if one.guard_test:
             lines.append(f"- test of the guard: `{one.guard_test}`")
@@ -67,7 +67,7 @@ def _unguarded_failures(maps: Sequence[StabilityMap]) -> list[str]:
     lines += ["", "| map | good | weak | broken | refused | remaining failures | symptom |"]
     lines += ["| --- | --: | --: | --: | --: | --- | --- |"]
     for one in maps:
-        broken = one.still_breaks()
+        broken = one.broken_cell_lines()
         seen = one.shows if broken else "–"
         lines.append(f"| {one.title} | {_row(one.reached())} | {'<br>'.join(broken) or 'nothing'} | {seen} |")
     return [*lines, ""]
@@ -85,7 +85,7 @@ def draw(one: StabilityMap, path: Path) -> None:
     panels = one.panels
     columns = min(_COLUMNS, len(panels))
     rows = math.ceil(len(panels) / columns)
-    tallest = max(len({cell.y for cell in one.of(panel)}) for panel in panels)
+    tallest = max(len({cell.y for cell in one.panel_cells(panel)}) for panel in panels)
     height = min(3.4, 1.0 + 0.5 * tallest)
     figure = Figure(figsize=(max(4.4 * columns, 7.0), height * rows + 0.9), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
@@ -95,7 +95,7 @@ def draw(one: StabilityMap, path: Path) -> None:
         axes.set_visible(False)
     present = [outcome for outcome, number in count_outcomes(one.cells).items() if number]
     handles = [Patch(color=COLOURS[outcome][0], label=outcome) for outcome in OUTCOMES if outcome in present]
-    if one.is_divided:
+    if one.is_partly_reachable:
         handles.append(Patch(facecolor="none", edgecolor="#14191d", linewidth=1.4, label="a job can reach this"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     figure.suptitle(one.title, x=0.01, ha="left", fontsize=13, fontweight="bold")
@@ -108,12 +108,12 @@ def draw(one: StabilityMap, path: Path) -> None:
 def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
     from matplotlib.patches import Rectangle
 
-    cells = one.of(panel)
+    cells = one.panel_cells(panel)
     xs, ys = (list(dict.fromkeys(getattr(cell, axis) for cell in cells)) for axis in ("x", "y"))
     for cell in cells:
         at = xs.index(cell.x), ys.index(cell.y)
         fill, ink = COLOURS[cell.outcome]
-        framed = cell.reached and one.is_divided
+        framed = cell.reached and one.is_partly_reachable
         edge: dict[str, Any] = {"edgecolor": "#14191d", "linewidth": 1.4} if framed else {"linewidth": 0}
         axes.add_patch(Rectangle((at[0] - 0.46, at[1] - 0.46), 0.92, 0.92, facecolor=fill, **edge))
         axes.text(*at, cell.text, ha="center", va="center", color=ink)

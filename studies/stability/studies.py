@@ -21,7 +21,7 @@ Values = Sequence[Any]  # values on an axis of a map
 ALL_HANDS: Final = ("allegro", "barrett", "shadow")  # hands for effects of different drives
 
 
-def run(
+def run_studies(
     names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, work: ExecutionContext, say: Say
 ) -> list[StabilityMap]:
     """Return the maps of the named studies; `say` receives a line per cell."""

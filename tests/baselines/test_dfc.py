@@ -25,7 +25,7 @@ def descent(pivot: tuple[float, float, float] = (0.0, 0.0, -0.2), q: tuple[float
 def evaluated(found: Descent, pivot: tuple[float, float, float], q: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
     found.proposal.set_state(HandState(np.array([pivot]), np.array([[1.0, 0, 0, 0]]), np.array([q])))
     found.new_terms.zero_()
-    for _, launch in found.launches.named()[1:-2]:
+    for _, launch in found.launches.named_commands()[1:-2]:
         launch.launch()
     return found.new_terms.numpy()[0].astype(float)
 
@@ -85,7 +85,7 @@ def test_the_gradient_is_the_difference_quotient_of_the_energy(q: tuple[float, f
 def _schedule(iteration_in: wp.array[wp.int32], rise_in: float, uniform_in: wp.array[float], out: wp.array[wp.vec3]):
     i = wp.tid()
     cold = kernels.temperature(iteration_in[i])
-    accepted = kernels.accepted(rise_in, cold, uniform_in[i])
+    accepted = kernels.is_accepted(rise_in, cold, uniform_in[i])
     out[i] = wp.vec3(kernels.step_size(iteration_in[i]), cold, float(accepted))
 
 

@@ -9,7 +9,7 @@ import warp as wp
 
 from graspd.baselines.common import load_pair
 from graspd.baselines.graspd2022 import kernels, method
-from graspd.baselines.graspd2022.method import Search, _Batch, distance_grid, physics_of
+from graspd.baselines.graspd2022.method import Search, _Batch, distance_grid, force_model
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.kernels.surface import Surface, field_distance
 from tests.worker.models import object_from_mesh, two_finger_hand, unit_vectors
@@ -42,7 +42,7 @@ def probed(points: np.ndarray, velocity: tuple[float, ...] = (0, 0, 0), grid=Non
     """Distance, force and slope at points by a grid, by default of the sphere."""
     found = wp.zeros((3, len(points)), dtype=wp.vec3, device="cpu")
     at = wp.array(points, dtype=wp.vec3, device="cpu")
-    given = [physics_of(SPHERE.gyration_radius), grid or grid_of_sphere(CELLS), at, wp.vec3(*velocity)]
+    given = [force_model(SPHERE.gyration_radius), grid or grid_of_sphere(CELLS), at, wp.vec3(*velocity)]
     wp.launch(_probe, len(points), inputs=given, outputs=[found], device="cpu")
     distance, force, slope = found.numpy()
     return distance[:, 0], force, slope
@@ -109,7 +109,7 @@ def settled(pull: float) -> tuple[np.ndarray, np.ndarray]:
     """Relaxed forces (N, 3, 3) under a constant pull of the task on x, and the contact forces (N, 3, 3)."""
     batch = touching_batch()
     batch.pull.assign([[kernels.vec6(pull, 0, 0, 0, 0, 0)] * 3])
-    launches = dict(batch.launches.named())
+    launches = dict(batch.launches.named_commands())
     launches["forward"].launch()
     for _ in range(800):
         launches["relax"].launch()

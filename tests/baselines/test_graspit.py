@@ -26,7 +26,7 @@ def _schedule(step_in: float, uniform_in: float, rise_in: float, out: wp.array[w
 def _evaluated(
     problem: kernels.Problem, state: kernels.vec8, p: wp.array2d[wp.vec3], q: wp.array2d[wp.quat], out: wp.array[float]
 ):
-    kernels.place(problem, 0, state, p, q)
+    kernels.pose_bodies(problem, 0, state, p, q)
     out[0] = kernels.contact_energy(problem, 0, p, q)
 
 

@@ -291,7 +291,7 @@ def test_what_shows_no_scene_or_no_clear_grasp_is_told(on_tables: Path, tmp_path
     said = refused("export --format dexgraspnet2 -o", tmp_path / "out", on_tables / "block.h5")
     assert "no picture shows" in said
     none = PictureReference(0, "base", "views", 0, np.eye(4), IDENTITY_POSE, np.zeros(0, np.intp))
-    monkeypatch.setattr(dexgraspnet2, "by_scene", lambda pictures: [[none]])
+    monkeypatch.setattr(dexgraspnet2, "group_by_scene", lambda pictures: [[none]])
     lots = [SimpleNamespace(id="base")]
     with pytest.raises(InputError, match="no grasp is valid and clear"):
         dexgraspnet2.write(lots, None, tmp_path, frozenset())

@@ -150,9 +150,9 @@ def test_a_cloud_of_a_free_object_lies_on_it_where_it_is_itself(on_tables: Path,
     seen = [look for look in pictures_without_pixels(pictures) if look.base != "a" * 64]
     assert len(seen) == 4
     for look in seen:
-        points = dexlearn.points_of(pictures, look, None, on_table=False)
+        points = dexlearn.object_points(pictures, look, None, on_table=False)
         assert np.abs(trimesh.proximity.closest_point(mesh, points)[1]).max() < POINT_M
-        noisy = dexlearn.points_of(pictures, look, noise_of("stereo"), on_table=False)
+        noisy = dexlearn.object_points(pictures, look, noise_of("stereo"), on_table=False)
         # A camera is off by some tenths of a millimetre and more, and has holes.
         assert 1e-4 < np.abs(trimesh.proximity.closest_point(mesh, noisy)[1]).max() < 0.05
 

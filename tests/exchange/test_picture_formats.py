@@ -109,4 +109,4 @@ def test_every_picture_is_one_sample_with_its_grasps(tmp_path) -> None:
     np.testing.assert_allclose(record["grasps"]["hand_pose"], expected["grasp/hand_pose"])
     assert record["grasp_frame"] == "camera"
     with pytest.raises(InputError, match="no picture"):
-        webdataset.write(Shards(shards.of("base")), tmp_path / "none")
+        webdataset.write(Shards(shards.of_kind("base")), tmp_path / "none")

@@ -7,12 +7,12 @@ import pytest
 import trimesh
 
 import graspd
-from graspd.service.command_options import parsed_options
+from graspd.service.command_options import validate_options
 from graspd.service.docs import STUB, keywords_stub
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import InputError
 from graspd.service.model.local_options import LocalOptions
-from graspd.service.model.options import rows
+from graspd.service.model.options import option_rows
 from tests.conftest import REPOSITORY
 
 
@@ -32,7 +32,7 @@ from tests.conftest import REPOSITORY
 )
 def test_every_message_is_in_the_words_of_the_caller(wrong: dict[str, Any], typed: str, called: str) -> None:
     with pytest.raises(InputError) as refused:
-        parsed_options(LocalOptions, wrong)
+        validate_options(LocalOptions, wrong)
     assert str(refused.value).startswith(typed)
     with pytest.raises(InputError) as refused:
         graspd.synthesize("barrett", "block", **wrong)
@@ -52,7 +52,7 @@ def test_a_keyword_that_is_none_is_a_type_error() -> None:
 
 
 def test_a_field_without_an_option_is_no_option_of_anybody() -> None:
-    assert {row.name for row in rows(JobRequest, "job")} == set(JobOptions.model_fields)
+    assert {row.name for row in option_rows(JobRequest, "job")} == set(JobOptions.model_fields)
 
 
 @pytest.mark.parametrize("kind", [str, Path])

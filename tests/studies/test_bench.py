@@ -80,7 +80,7 @@ def test_unknown_fidelities_and_no_networks_are_told(tmp_path, capsys: pytest.Ca
 
 def test_a_study_plans_the_grasps_of_a_job() -> None:
     wish = JobOptions(want="candidates", fidelity="draft", seed=5, rechecks=0)
-    hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=wish.knobs.face_error_m)
+    hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=wish.resolved_fidelity.face_error_m)
     made = validated_grasps(hand, obj, wish, count=2).grasps
     found = planned(hand, obj, count=2, seed=5, fidelity="draft")
     assert np.array_equal(found.grasp.hand_pose, made.grasp.hand_pose)

@@ -13,7 +13,7 @@ from graspd.service.model.errors import MeshError, TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.worker import batched_generation, generation
 from graspd.worker.batched_generation import validated_batches
-from graspd.worker.engines.batch_sizes import batches_at_once, batches_that_fit
+from graspd.worker.engines.batch_sizes import batches_per_launch, batches_that_fit
 from graspd.worker.execution_context import CoreSharing, ExecutionContext, parallel_map
 from graspd.worker.files.synthesis import synthesize_grasps
 from graspd.worker.generation import ValidatedBatch, validated_grasps
@@ -32,7 +32,7 @@ COUNT = 2 * SMALLEST_PART
 
 @pytest.fixture(scope="module")
 def pair():
-    return hand_from_path("barrett"), object_from_path("block", face_error_m=REQUEST.knobs.face_error_m)
+    return hand_from_path("barrett"), object_from_path("block", face_error_m=REQUEST.resolved_fidelity.face_error_m)
 
 
 @pytest.fixture(scope="module")
@@ -278,7 +278,7 @@ def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:
 
 
 def test_how_many_are_joined_where_nobody_says() -> None:
-    assert batches_at_once("cpu", None) == 1 and batches_at_once("cpu", 4) == 4
+    assert batches_per_launch("cpu", None) == 1 and batches_per_launch("cpu", 4) == 4
     # Of an H100 and an H200 (132 multiprocessors), of a GPU with 20, and of one whose memory is nearly full.
     assert [
         batches_that_fit(132, 80 << 30),

@@ -47,7 +47,7 @@ class Balance:
         kinds = self._kinds(shards)
         wanted = np.concatenate([validity.valid_mask(shard.arrays) for shard in shards])
         if self.min_distance > 0 and wanted.any():
-            wanted[np.flatnonzero(wanted)[~self._distinct(shards, wanted)]] = False
+            wanted[np.flatnonzero(wanted)[~self._distinct_mask(shards, wanted)]] = False
         _, kind = np.unique(kinds, axis=0, return_inverse=True)
         counts = np.bincount(kind.ravel()[wanted])
         limit = self.at_most or int(np.median(counts[counts > 0])) if wanted.any() else 0
@@ -69,7 +69,7 @@ class Balance:
             columns.append(np.concatenate([np.asarray(shard[_COLUMNS[name]], np.int64) for shard in shards]))
         return np.stack(columns, axis=1)
 
-    def _distinct(self, shards: list[Shard], wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _distinct_mask(self, shards: list[Shard], wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
         hand = hand_of_shard(shards[0], self.hand)
         parts = [Posture.from_columns(shard.arrays) for shard in shards]
         pose = np.concatenate([part.hand_pose for part in parts])[wanted]

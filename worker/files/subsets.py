@@ -23,7 +23,7 @@ from graspd.service.store.store import open_store
 Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
 
 
-def shards_of(source: str) -> Shards:
+def open_source(source: str) -> Shards:
     """Return the shards of a file or folder, or of a dataset in this machine's store by name.
     Raises NotFoundError: none of these exists."""
     if "/" in source or source in (".", "..") or Path(source).exists():
@@ -49,7 +49,7 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
     require_empty_folder(out)
     looked_at = kept = 0
     ready: list[tuple[PurePosixPath, bytes]] = []
-    for _, files in groupby(shards.of("base"), key=lambda file: (file.hand, file.object)):
+    for _, files in groupby(shards.of_kind("base"), key=lambda file: (file.hand, file.object)):
         together = [read_shard(shards.path(file), kind="base") for file in files]
         for shard, mask in zip(together, choose(together), strict=True):
             looked_at, kept = looked_at + len(mask), kept + int(mask.sum())
@@ -62,7 +62,7 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
         (out / path).write_bytes(data)
     summary = {**said, "looked_at": looked_at, "kept": kept, "shards": [str(path) for path, _ in ready]}
     (out / "subset.json").write_text(json.dumps(summary, indent=1) + "\n")
-    passed_over = len(shards) - len(shards.of("base"))
+    passed_over = len(shards) - len(shards.of_kind("base"))
     return {"looked_at": looked_at, "kept": kept, "shards": len(ready), "passed_over": passed_over}
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
 from graspd.worker.hands.model import HandModel, SurfacePoints
-from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
+from graspd.worker.hands.pinch_postures import PinchPostures, pinch_postures_of
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.memory_cache import cached_by_content
 
@@ -56,19 +56,19 @@ _NEXT_TO: Final = 1e-9
 
 
 @cached_by_content(32)
-def postures_for_size(hand: HandModel, size: Size) -> Oppositions:
+def postures_for_size(hand: HandModel, size: Size) -> PinchPostures:
     """Return postures for small or wide objects, cached in memory and on disk."""
     key = (hand.content, size)
-    return Oppositions.cached("spans", key, lambda: _search_postures(hand, size), sys.modules[__name__])
+    return PinchPostures.load_or_search("spans", key, lambda: _search_postures(hand, size), sys.modules[__name__])
 
 
 def largest_width(hand: HandModel) -> float:
     """Return an upper bound of the widths in `postures_for_size` [m], from `oppositions_of` alone."""
-    return WIDER * oppositions_of(hand).widest + GOOD_M
+    return WIDER * pinch_postures_of(hand).widest + GOOD_M
 
 
-def _search_postures(hand: HandModel, size: Size) -> Oppositions:
-    widest = oppositions_of(hand).widest
+def _search_postures(hand: HandModel, size: Size) -> PinchPostures:
+    widest = pinch_postures_of(hand).widest
     least, most = SMALL_M if size == "small" else (widest, WIDER * widest)
     rng, look = np.random.default_rng(0), _PairSearch(hand, size)
     wanted = np.linspace(least, most, POSTURES)
@@ -83,7 +83,7 @@ def _search_postures(hand: HandModel, size: Size) -> Oppositions:
         better = new.cost < found.cost
         q[better] = tried[better]
         found.take(better, new)
-    return Oppositions.of(q, found, np.flatnonzero(found.cost < GOOD_M))
+    return PinchPostures.select(q, found, np.flatnonzero(found.cost < GOOD_M))
 
 
 @dataclass

@@ -46,13 +46,13 @@ class Couplings:
             self._add_equality(equality)
         self._add_tendons()
         self._add_loops([e for e in active if model.eq_type[e] == int(mujoco.mjtEq.mjEQ_CONNECT)])
-        self._hold_followers()
+        self._fix_followers()
 
     def _add_equality(self, equality: int) -> None:
         first, second = int(self.model.eq_obj1id[equality]), int(self.model.eq_obj2id[equality])
         polynomial, kind = np.asarray(self.model.eq_data[equality, :5]), int(self.model.eq_type[equality])
         if kind == int(mujoco.mjtEq.mjEQ_JOINT):
-            self._couple(first, second, polynomial)
+            self._couple_joints(first, second, polynomial)
         if kind != int(mujoco.mjtEq.mjEQ_TENDON):
             return
         ends = [joints_on_tendon(self.model, tendon) if tendon >= 0 else [] for tendon in (first, second)]
@@ -61,11 +61,11 @@ class Couplings:
         elif len(ends[0]) == len(ends[1]) == 1:
             # c1 (q1 - q1_0) = p(c2 (q2 - q2_0))
             ((one, own),), ((other, pull),) = ends
-            self._couple(one, other, polynomial * pull ** np.arange(5) / own)
+            self._couple_joints(one, other, polynomial * pull ** np.arange(5) / own)
         else:
             self.notes.append("an equality of tendons with several joints was left out")
 
-    def _hold_followers(self) -> None:
+    def _fix_followers(self) -> None:
         """Fix the joints that follow a fixed joint."""
         held = {self.name(joint): value for joint, value in self.follows.items() if isinstance(value, float)}
         while moved := [(j, f) for j, f in self.follows.items() if isinstance(f, Mimic) and f.joint in held]:
@@ -73,12 +73,12 @@ class Couplings:
                 value = follows.multiplier * held[follows.joint] + follows.offset
                 self.follows[joint] = held[self.name(joint)] = float(np.clip(value, *self._range(joint)))
 
-    def _couple(self, first: int, second: int, polynomial: Floats) -> None:
+    def _couple_joints(self, first: int, second: int, polynomial: Floats) -> None:
         """Couple by first - first0 = p(second - second0); a nonlinear p is replaced by its best line."""
         if second < 0:
             self.follows[first] = self._rest(first) + float(polynomial[0])
             return
-        if first in self.follows or first == second or self._follows(second, first):
+        if first in self.follows or first == second or self._is_driven_by(second, first):
             self.notes.append(f"a second equality of {self.name(first)!r} was left out")
             return
         constant, slope = float(polynomial[0]), float(polynomial[1])
@@ -90,7 +90,7 @@ class Couplings:
         offset = self._rest(first) + constant - slope * self._rest(second)
         self.follows[first] = Mimic(self.name(second), slope, offset)
 
-    def _follows(self, joint: int, first: int) -> bool:
+    def _is_driven_by(self, joint: int, first: int) -> bool:
         """Check whether a joint follows another one through any chain."""
         number = {self.name(j): j for j in self.follows}
         while isinstance(follows := self.follows.get(joint), Mimic):
@@ -130,7 +130,7 @@ class Couplings:
             free = [(j, c) for j, c in pulled if j not in self.follows and j not in alone and abs(c) > 1e-9]
             if len(free) < 2:
                 continue
-            if self._form_chain([joint for joint, _ in free]):
+            if self._is_chain([joint for joint, _ in free]):
                 self.tendons[str(self.model.actuator(actuator).name) or f"tendon_{actuator}"] = dict(free)
                 continue
             (driver, pull), *others = free
@@ -139,9 +139,11 @@ class Couplings:
             followers = ", ".join(self.name(joint) for joint, _ in others)
             self.notes.append(f"{followers} assumed to follow {self.name(driver)} on their tendon")
 
-    def _form_chain(self, joints: list[int]) -> bool:
+    def _is_chain(self, joints: list[int]) -> bool:
         """Check whether the joints form one chain."""
-        chains = sorted((set(chain_up(self.model, int(self.model.jnt_bodyid[joint]))) for joint in joints), key=len)
+        chains = sorted(
+            (set(bodies_to_root(self.model, int(self.model.jnt_bodyid[joint]))) for joint in joints), key=len
+        )
         return all(a <= b for a, b in itertools.pairwise(chains))
 
     def _range(self, joint: int) -> tuple[float, float]:
@@ -153,7 +155,7 @@ class Couplings:
 
     def _add_loops(self, loops: list[int]) -> None:
         """Solve the loops of the model; record a fault for joints of a loop that cannot be solved."""
-        for group in _groups(self.model, loops):
+        for group in _connected_loops(self.model, loops):
             joints = sorted({j for e in group for j in _loop_joints(self.model, e)})
             passive = [j for j in joints if j not in self._actuated and j not in self.follows]
             if not passive:
@@ -226,7 +228,7 @@ def _fit_line(at: Floats, values: Floats) -> tuple[float, float, float]:
     return slope, constant, float(np.abs(values - constant - slope * at).max())
 
 
-def _groups(model: Any, loops: list[int]) -> list[list[int]]:
+def _connected_loops(model: Any, loops: list[int]) -> list[list[int]]:
     groups: list[tuple[set[int], list[int]]] = []
     for loop in loops:
         joints = set(_loop_joints(model, loop))
@@ -236,7 +238,7 @@ def _groups(model: Any, loops: list[int]) -> list[list[int]]:
     return [members for _, members in groups]
 
 
-def _ends(model: Any, loop: int) -> tuple[int, int]:
+def _loop_bodies(model: Any, loop: int) -> tuple[int, int]:
     first, second = int(model.eq_obj1id[loop]), int(model.eq_obj2id[loop])
     if model.eq_objtype[loop] == int(mujoco.mjtObj.mjOBJ_SITE):
         return int(model.site_bodyid[first]), int(model.site_bodyid[second])
@@ -245,7 +247,7 @@ def _ends(model: Any, loop: int) -> tuple[int, int]:
 
 def _loop_joints(model: Any, loop: int) -> list[int]:
     """Return the joints between a loop's ends and the body at which their chains branch."""
-    chains = [chain_up(model, body) for body in _ends(model, loop)]
+    chains = [bodies_to_root(model, body) for body in _loop_bodies(model, loop)]
     common = set(chains[0]) & set(chains[1])
     return [
         joint
@@ -256,7 +258,7 @@ def _loop_joints(model: Any, loop: int) -> list[int]:
     ]
 
 
-def chain_up(model: Any, body: int) -> list[int]:
+def bodies_to_root(model: Any, body: int) -> list[int]:
     """Return the bodies from this one up to a child of the world."""
     found = []
     while body:
@@ -281,7 +283,7 @@ def _close_loops(
         rows, residuals = [], []
         for loop in loops:
             points = _anchors(model, data, loop)
-            for k, (point, body) in enumerate(zip(points, _ends(model, loop), strict=True)):
+            for k, (point, body) in enumerate(zip(points, _loop_bodies(model, loop), strict=True)):
                 mujoco.mj_jac(model, data, jacobians[k], None, point, body)
             rows.append((jacobians[0] - jacobians[1])[:, dofs])
             residuals.append(points[0] - points[1])
@@ -299,7 +301,7 @@ def _anchors(model: Any, data: Any, loop: int) -> tuple[Floats, Floats]:
     if model.eq_objtype[loop] == int(mujoco.mjtObj.mjOBJ_SITE):
         return data.site_xpos[int(model.eq_obj1id[loop])], data.site_xpos[int(model.eq_obj2id[loop])]
     points = []
-    for body, local in zip(_ends(model, loop), (model.eq_data[loop, :3], model.eq_data[loop, 3:6]), strict=True):
+    for body, local in zip(_loop_bodies(model, loop), (model.eq_data[loop, :3], model.eq_data[loop, 3:6]), strict=True):
         points.append(data.xpos[body] + data.xmat[body].reshape(3, 3) @ local)
     return points[0], points[1]
 

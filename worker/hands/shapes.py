@@ -46,7 +46,7 @@ def make_pieces(
     name = ""
     try:
         if shape.mesh is not None:
-            found = _hulls(*shape.mesh)
+            found = _reduced_hulls(*shape.mesh)
         else:
             name = find_mesh(shape.filename, files, base, link)
             key = (name, shape.size)
@@ -75,10 +75,10 @@ def _mesh_hulls(name: str, scale: tuple[float, ...], data: bytes, link: str) -> 
             f"collision mesh {name!r} of link {link!r} is {np.ptp(points, axis=0).max():.3g} m long; "
             'if it is in millimetres give it scale="0.001 0.001 0.001"'
         )
-    return _hulls(points, soup.faces.astype(np.int32))
+    return _reduced_hulls(points, soup.faces.astype(np.int32))
 
 
-def _hulls(points: Floats, faces: Ints) -> list[tuple[Floats, Ints]]:
+def _reduced_hulls(points: Floats, faces: Ints) -> list[tuple[Floats, Ints]]:
     # Hulls use all points of a file, including points that no face uses: `convex_parts` returns them for one hull.
     return [reduce_hull(part) for part in convex_parts(points, faces)]
 
@@ -87,11 +87,11 @@ def reduce_hull(points: Floats) -> tuple[Floats, Ints]:
     """Compute a hull of points (N, 3) with at most `MAX_HULL_VERTICES` corners and the full hull's volume.
     The corner farthest from the current hull is added repeatedly; then all are scaled about their centroid until the
     volumes agree. The surface error has both signs and half the size of an inscribed hull's error."""
-    made = cached_step("reduced hull", [points, np.array(MAX_HULL_VERTICES)], lambda: _reduce(points))
+    made = cached_step("reduced hull", [points, np.array(MAX_HULL_VERTICES)], lambda: _compute_reduced_hull(points))
     return made["0"], made["1"]
 
 
-def _reduce(points: Floats) -> tuple[Floats, Ints]:
+def _compute_reduced_hull(points: Floats) -> tuple[Floats, Ints]:
     vertices, faces = compute_hull(points)
     if len(vertices) <= MAX_HULL_VERTICES:
         return vertices, faces
@@ -210,7 +210,7 @@ class _OpenSurface:
     def __init__(self, vertices: Floats, faces: Ints) -> None:
         corners, self._points = vertices[faces], _sample(vertices, faces)
         # (D, P) whether a ray in a direction from a point misses the mesh.
-        self._sees = np.array([~_hits(self._points, direction, corners) for direction in _DIRECTIONS])
+        self._sees = np.array([~_hit_mask(self._points, direction, corners) for direction in _DIRECTIONS])
 
     def error(self, parts: tuple[Floats, ...]) -> float:
         """Return the ninth decile of the open surface's depth in the union of the parts [m]."""
@@ -224,7 +224,7 @@ class _OpenSurface:
         return float(np.quantile(shortest[reached], _SHARE))
 
 
-def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool_]:
+def _hit_mask(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool_]:
     """Return a mask (P,) of the rays that hit any triangle (F, 3, 3) (Moeller and Trumbore 1997)."""
     a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     across = np.cross(direction, second)

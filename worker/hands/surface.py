@@ -98,7 +98,7 @@ def _candidates(hand: _Shapes, count: int, seed: int) -> SurfacePoints:
         vertices = _local_vertices(piece)
         local, direction = primitives.sample(piece.kind, piece.size, vertices, piece.faces, int(number), rng)
         position, normal = apply(piece.pose, local), quat_rotate(piece.pose[3:], direction)
-        keep = ~_is_buried(hand, i, position, normal)
+        keep = ~_buried_mask(hand, i, position, normal)
         body, area = np.full(len(keep), piece.body, np.int32), np.full(len(keep), shares[i] / number)
         parts.append((body[keep], position[keep], normal[keep], area[keep]))
     return SurfacePoints(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
@@ -114,7 +114,7 @@ def piece_distance(piece: ConvexPiece, points: Floats) -> Floats:
     return primitives.signed_distance(piece.kind, piece.size, _local_vertices(piece), piece.faces, local)
 
 
-def _is_buried(hand: _Shapes, own: int, position: Floats, normal: Floats) -> NDArray[np.bool_]:
+def _buried_mask(hand: _Shapes, own: int, position: Floats, normal: Floats) -> NDArray[np.bool_]:
     """Return a mask (N,) of points of piece `own` inside another piece or on a face of an earlier piece."""
     mine = hand.pieces[own]
     above, below = position + COINCIDENT_M * normal, position - COINCIDENT_M * normal

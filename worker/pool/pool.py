@@ -61,8 +61,8 @@ class Pool(AbstractContextManager["Pool"]):
     def __init__(self, processes: int, modules: Sequence[str] = ()) -> None:
         """`modules` are imported by each process before its first item."""
         self.processes = processes
-        self._places = [_Place(modules) for _ in range(processes)]
-        self._idle: queue.SimpleQueue[_Place] = queue.SimpleQueue()
+        self._places = [_Slot(modules) for _ in range(processes)]
+        self._idle: queue.SimpleQueue[_Slot] = queue.SimpleQueue()
         self._threads = ThreadPoolExecutor(processes, thread_name_prefix="pool")
         self._changing = threading.Lock()
         self._started = self._closed = False
@@ -127,7 +127,7 @@ class Pool(AbstractContextManager["Pool"]):
     def _do(self, request: _Request, number: int, part: Any) -> Any:
         place = self._idle.get()
         try:
-            made = place.do(request, part)
+            made = place.run_item(request, part)
         finally:
             self._idle.put(place)
             if self._closed:
@@ -137,7 +137,7 @@ class Pool(AbstractContextManager["Pool"]):
         return made
 
 
-class _Place:
+class _Slot:
     """A place of the pool: one process at a time, and the keys in its cache. Any thread may call `end`."""
 
     def __init__(self, modules: Sequence[str]) -> None:
@@ -155,7 +155,7 @@ class _Place:
             env={**os.environ, **_NO_GPU},
         )
 
-    def do(self, request: _Request, part: Any) -> Any:
+    def run_item(self, request: _Request, part: Any) -> Any:
         """Return the result of an item; raise ProcessLost, or the error of the item."""
         try:
             if self._is_gone():

@@ -26,7 +26,7 @@ from rq.serializers import JSONSerializer
 from rq.worker import WorkerStatus
 
 from graspd.service.model.errors import GraspdError, QueueUnavailable, TaskRefused
-from graspd.service.model.messages import WorkerBeat, capabilities
+from graspd.service.model.messages import WorkerHeartbeat, capabilities
 from graspd.service.model.states import Stage
 from graspd.service.queue import entries
 from graspd.service.queue.connection import redis_url
@@ -76,7 +76,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
 
     def check_service(self) -> None:
         """Raise BusyError if Redis belongs to another service, InputError if the device is unknown."""
-        self._engine.send("service", self._queue.service())
+        self._engine.send("service", self._queue.service_id())
         self._await("service")
 
     def admit(self) -> bool:
@@ -192,7 +192,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             try:
                 found = super().dequeue_job_and_maintain_ttl(*args, **options)
                 self.found_none = found is None
-                return found and (entries.checked_job(*found), found[1])
+                return found and (entries.sanitized_job(*found), found[1])
             except TaskRefused as error:
                 log.warning("%s", error)
                 self.connection.delete(found[0].key)
@@ -233,7 +233,7 @@ def run_worker(
     queue = open_queue(settings, patience=_PATIENCE)
     heart = Heartbeat(
         redis_url(settings),
-        WorkerBeat.of_this_process(name, settings.device, stages),
+        WorkerHeartbeat.of_this_process(name, settings.device, stages),
         lease_s=settings.lease_s,
         alive=settings.heartbeat_file,
         is_stopped=lambda: engine.is_stopped,

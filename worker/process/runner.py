@@ -41,7 +41,7 @@ from graspd.service.telemetry import bind_subjects
 from graspd.worker.engines.devices import DeviceLost, check_device
 from graspd.worker.pool.pool import ProcessLost
 from graspd.worker.process.fitness import Fitness, is_first_loss
-from graspd.worker.stages.context import StageFunction, StopReason, TaskContext, shard_of
+from graspd.worker.stages.context import StageFunction, StopReason, TaskContext, build_shard
 
 log = logging.getLogger(__name__)
 _TRACE_CHARACTERS: Final = 8000
@@ -75,12 +75,12 @@ class Runner:
     def _run(self, message: Message, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
         started, clock = timestamp(), time.monotonic()
         try:
-            if lacking := capabilities().lacks(requirements_of(message)):
+            if lacking := capabilities().unmet_requirement(requirements_of(message)):
                 # The task is for another worker. The controller reports tasks that no present worker can do.
                 return self._event(EventKind.DEFERRED, message, message=f"this worker cannot run it: {lacking}")
             return self._do(message, context)
         except TaskCancelled:
-            return self._stopped(message, context, started)
+            return self._stopped_event(message, context, started)
         except UnavailableError as error:
             return self._event(EventKind.DEFERRED, message, message=str(error))
         except Exception as error:
@@ -113,7 +113,7 @@ class Runner:
         if made is not None and isinstance(message, TaskMessage):
             context.check()
             device, worker = context.device, self._worker
-            manifest, data = shard_of(message, made, device=device, seconds=seconds, worker=worker, lost=lost)
+            manifest, data = build_shard(message, made, device=device, seconds=seconds, worker=worker, lost=lost)
             if lost is not None and manifest.sha256 != lost.sha256:
                 raise DamagedShard(
                     f"{lost.key} was made again with another content: first on {lost.device} by graspd "
@@ -146,7 +146,7 @@ class Runner:
             return None
         return load_manifest(context.store, message.stage, message.output)
 
-    def _stopped(self, message: Message, context: TaskContext, started: str) -> Event | None:
+    def _stopped_event(self, message: Message, context: TaskContext, started: str) -> Event | None:
         reason = context.stop_reason
         if reason is StopReason.TIMEOUT:
             error = TimeoutError("the task exceeded the time limit GRASPD_TASK_TIMEOUT_S")
@@ -158,7 +158,7 @@ class Runner:
         log.warning("task failed: %s", error, exc_info=not isinstance(error, InputError))
         # Retries fix neither invalid input nor a damaged store.
         last = isinstance(error, InputError | DamagedError | TaskRefused) or message.attempt >= message.max_attempt
-        attempt = AttemptRecord.of(
+        attempt = AttemptRecord.from_message(
             message,
             kind=type(error).__name__,
             reason=_one_line(error),

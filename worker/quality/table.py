@@ -44,7 +44,7 @@ from graspd.worker.quality.contact import (
 from graspd.worker.quality.diversity import approach_cells
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, Probe, probe_of
 from graspd.worker.quality.volume import Overlap, SharedVolume, penetration_depth
-from graspd.worker.quality.wrench_space import measure_spaces, wrenches
+from graspd.worker.quality.wrench_space import contact_wrenches, measure_spaces
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -167,12 +167,12 @@ class _Chunk:
     def spaces(self) -> tuple[Floats, Floats]:
         """Epsilon and volume (B, T) of the wrench spaces of B grasps."""
         pair, found, obj = self.pair, self.found, self.pair.obj
-        near = pair.probe.facing(found)[:, None] & (np.abs(found.distance)[:, None] < pair.thresholds[:, None])
+        near = pair.probe.facing_mask(found)[:, None] & (np.abs(found.distance)[:, None] < pair.thresholds[:, None])
         chosen, count = spread_contacts(near, found.closest, found.normal, scale=obj.radius, limit=MAX_CONTACTS)
         rows = np.arange(len(chosen))[:, None, None]
         counts = (np.arange(MAX_CONTACTS) < count[..., None])[..., None]
         place, inward = found.closest[rows, chosen], np.where(counts, -found.normal[rows, chosen], [0.0, 0.0, 1.0])
-        edges = wrenches(place, inward, friction=pair.friction, centre=obj.centre_of_mass, radius=obj.radius)
+        edges = contact_wrenches(place, inward, friction=pair.friction, centre=obj.centre_of_mass, radius=obj.radius)
         wanted = np.broadcast_to(pair.with_volume, count.shape)
         epsilon, volume = measure_spaces(edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel())
         return epsilon.reshape(count.shape), volume.reshape(count.shape)
@@ -181,8 +181,8 @@ class _Chunk:
         # A face may enter a piece between object points, but a point is within half a diagonal of their grid.
         near = self.found.piece_distance < self.pair.probe.sample_spacing
         if self.pair.volume.is_exact:
-            near = self.pair.overlap.of(self.found, near)
-        return self.pair.volume.of(self.found.bodies, near)
+            near = self.pair.overlap.overlapping_pieces(self.found, near)
+        return self.pair.volume.volumes(self.found.bodies, near)
 
 
 #: Metrics of B grasps: (B, T) if swept over thresholds, else (B,). `GRASP_METRICS` has their units.

@@ -44,7 +44,7 @@ class SharedVolume:
     def is_exact(self) -> bool:
         return self._object is not None
 
-    def of(self, bodies: Floats, near: NDArray[np.bool_]) -> Floats:
+    def volumes(self, bodies: Floats, near: NDArray[np.bool_]) -> Floats:
         """Compute the volume (B,) inside both the object and the union of the hand's pieces [cm^3].
         The bodies are at (B, L, 7) in the object frame; only pieces `near` (B, P) count."""
         return np.array([self._one(bodies[b], np.flatnonzero(near[b])) for b in range(len(bodies))])
@@ -114,7 +114,7 @@ class Overlap:
             wp.load_module(module=kernels, device="cpu")
         self._solids = _solids(hand.pieces)
 
-    def of(self, found: Distances, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def overlapping_pieces(self, found: Distances, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return a mask (B, P) of those `near` (B, P) pieces that may share volume with the object."""
         row, piece = np.nonzero(near)
         if not len(row):

@@ -20,7 +20,7 @@ from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.mesh_geometry import to_centred_frame, to_file_frame
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.topology import outward_hull
-from graspd.worker.scenes.kinds import SUNK, check_free, move_inside, rest_poses, supports_of, walled_area
+from graspd.worker.scenes.kinds import SUNK, move_inside, require_no_penetration, rest_poses, supports_of, walled_area
 from graspd.worker.scenes.neighbours import drop_together, place_neighbours
 from graspd.worker.simulation.environment import Neighbour, Obstacle, Scenes
 from graspd.worker.validation.decomposition import decompose
@@ -119,12 +119,12 @@ def _scenes_of(
         except MeshError:
             # With too many objects, no drop ends with all of them apart.
             poses = _place_objects(SceneSpec(kind="table"), obj, others, supports, count=count, seed=seed)
-        check_free(obj, poses["scene/object_pose"], supports)
+        require_no_penetration(obj, poses["scene/object_pose"], supports)
     else:
         poses = _place_objects(spec, obj, others, supports, count=count, seed=seed)
     beside = tuple(neighbour_of(other) for other in others)
     for number, other in enumerate(others):
-        check_free(other, poses["scene/neighbour_pose"][:, number], supports)
+        require_no_penetration(other, poses["scene/neighbour_pose"][:, number], supports)
     if given:
         whole = np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
         _check_apart([neighbour_of(obj), *beside], whole)

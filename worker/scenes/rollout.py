@@ -37,7 +37,7 @@ FALLS: Final = 0.4
 BEST: Final = 0.99
 
 
-def rollout_on(
+def create_rollout(
     run: ExecutionContext,
     hand: HandModel,
     obj: ObjectModel,
@@ -192,7 +192,7 @@ def scene_verdicts(
     return grasps, columns
 
 
-def outcomes_in_scenes(columns: Arrays) -> dict[str, NDArray[np.bool_]]:
+def outcome_masks(columns: Arrays) -> dict[str, NDArray[np.bool_]]:
     """Return masks (N,) of grasps that are clear, lifted, and lifted at half friction (`scene_verdicts`)."""
     clear = np.asarray(columns["quality/success"] >= 0)
     if "quality/lift_outcome" not in columns:

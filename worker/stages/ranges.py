@@ -61,7 +61,7 @@ def join_outputs(message: TaskMessage, made: Sequence[Output], *, base_rows: Seq
     attributes = {**made[0].attributes}
     if kind == "base":
         attributes["batch_rows"] = json_attribute([len(part["grasp/hand_pose"]) for part in parts])
-    return Output(columns, attributes, _summed([output.info for output in made]))
+    return Output(columns, attributes, _combine_records([output.info for output in made]))
 
 
 def base_rows(base: Shard, message: TaskMessage) -> list[range]:
@@ -73,7 +73,7 @@ def base_rows(base: Shard, message: TaskMessage) -> list[range]:
     return [range(start, start + count) for start, count in zip(_starts(counts), counts, strict=True)]
 
 
-def _summed(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _combine_records(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Combine the records of several batches.
     Counts and seconds are summed, shares averaged with the planned grasps as weights; others are the first batch's."""
     found = dict(records[0])

@@ -52,7 +52,7 @@ def _make_scenes(message: TaskMessage, context: TaskContext) -> Output:
     """Place the object and its neighbours in `request.scenes` scenes.
     Raises SceneError: they do not fit, penetrate each other, or do not come to rest."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
-    place = message.request.place
+    place = message.request.scene_spec
     # The first batch has the same scenes as `graspd synth` with the same seed.
     seed = batch_seed(message) if message.batch else message.request.seed
     others = neighbours_of(context.store, message)

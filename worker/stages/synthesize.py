@@ -49,7 +49,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             first=message.batch,
             join=context.join,
             scenes=scenes or None,
-            pieces=lambda prepared: assets.pieces_of(context.store, prepared),
+            pieces=lambda prepared: assets.load_pieces(context.store, prepared),
             run=context.run,
             checked=partial(_stop_if_empty, message, in_scenes=bool(scenes)),
             empty_on=(NoStartFound,) if scenes else (),
@@ -98,7 +98,7 @@ def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str,
 
 
 def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: TaskContext) -> Scenes:
-    scenes = Scenes(supports_of(message.request.place), columns["scene/object_pose"])
+    scenes = Scenes(supports_of(message.request.scene_spec), columns["scene/object_pose"])
     if not (others := assets.neighbours_of(context.store, message)):
         return scenes
     beside = tuple(neighbour_of(other) for other in others)
@@ -110,13 +110,13 @@ def _stop_if_empty(message: TaskMessage, batch: int, found: ValidatedBatch, *, i
     request, limit = message.request, found.limit
     if batch or request.want == "candidates" or len(found.grasps):
         return
-    none = f"none of {found.planned} candidates is {request.counted}"
+    none = f"none of {found.planned} candidates is {request.counted_status}"
     if limit is not None and limit.is_far_exceeded:
         raise LoadError(f"{none}: {limit.line}")
     if in_scenes:
         reasons = [format_outcomes(found.outcomes), found.narrow, limit.line if limit is not None else ""]
         lost = "; ".join(filter(None, reasons))
         raise SceneError(
-            f"{none} in its scene ({request.place.kind}): {lost}; give "
+            f"{none} in its scene ({request.scene_spec.kind}): {lost}; give "
             f"a larger budget than {request.budget:g} candidates for each grasp, or another pose, scene, hand or seed"
         )

@@ -54,7 +54,7 @@ class LiftOutcome(IntEnum):
 
 
 @dataclass
-class LiftTest:
+class LiftResult:
     outcome: LiftOutcome = LiftOutcome.NOT_TRIED
     margin: float = 0.0
     """Larger ratio of final deviation in position or rotation to its limit; 0 if the hand did not rise."""
@@ -73,9 +73,9 @@ class Lift(Test):
         self.placed = placed
         self._goal = np.zeros(3)
         self._in_hand = True
-        self._beside = placed.neighbours_of(0)
+        self._beside = placed.relative_neighbour_poses(0)
 
-    def dexgraspbench(self, grasps: GraspSet, row: int) -> LiftTest:  # type: ignore[override]
+    def dexgraspbench(self, grasps: GraspSet, row: int) -> LiftResult:  # type: ignore[override]
         """Run the published test: one check of the object's world pose, after the rise."""
         self._in_hand = False
         if (rollout := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
@@ -84,12 +84,12 @@ class Lift(Test):
         self._rise(grasps, row, np.arange(1, STAGES + 1) / STAGES, STAGE_S)
         return self._result(rollout, self._validate(Rollout()))
 
-    def lift(self, grasps: GraspSet, row: int) -> LiftTest:
+    def lift(self, grasps: GraspSet, row: int) -> LiftResult:
         """Run the test from the standoff to the end of the hold, along `grasps.approach`."""
         self._in_hand = True
         if (rollout := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
             return rollout
-        if self._touches(grasps, row):
+        if self._collides_on_approach(grasps, row):
             rollout.outcome = LiftOutcome.TOUCHED_ON_THE_WAY
             return rollout
         if not self._close(grasps, row, give_up=True):
@@ -104,16 +104,16 @@ class Lift(Test):
             rollout.outcome = LiftOutcome.NEIGHBOUR_MOVED
         return rollout
 
-    def _begin(self, grasps: GraspSet, row: int) -> LiftTest:
+    def _begin(self, grasps: GraspSet, row: int) -> LiftResult:
         """Set up the grasp's scene with all objects at rest; gravity acts on objects but not on the hand."""
         self._steps, number = 0, int(self.placed.index[row])
         self._scene_pose = invert(np.asarray(self.placed.object_pose[number], float))
         self._up = self.placed.scenes[number].up
-        self._beside = self.placed.neighbours_of(number)
+        self._beside = self.placed.relative_neighbour_poses(number)
         self._goal = np.zeros(3)
         self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
         mujoco.mj_forward(self.scene.model, self.data)
-        rollout = LiftTest()
+        rollout = LiftResult()
         if max(self.penetration()) > MAX_PENETRATION_M:
             rollout.outcome = LiftOutcome.PENETRATION
         return rollout
@@ -136,7 +136,7 @@ class Lift(Test):
                 return True
         return False
 
-    def _touches(self, grasps: GraspSet, row: int) -> bool:
+    def _collides_on_approach(self, grasps: GraspSet, row: int) -> bool:
         """Check whether the open hand penetrates the object or a support on its approach."""
         assert grasps.approach is not None, "a lift needs the grasps' approach"
         assert grasps.coming is not None
@@ -184,8 +184,8 @@ class Lift(Test):
             at = self.data.mocap_pos[0] + quat_rotate(quat_conjugate(turn), at - root)
         return np.asarray(at - self._goal)
 
-    def _turned(self) -> Floats:
-        turned, yielded = super()._turned(), self._root_deviation()
+    def _rotation(self) -> Floats:
+        turned, yielded = super()._rotation(), self._root_deviation()
         return turned if yielded is None else quat_multiply(quat_conjugate(yielded[1]), turned)
 
     def _root_deviation(self) -> tuple[Floats, Floats] | None:
@@ -198,7 +198,7 @@ class Lift(Test):
         root = self.data.qpos[at : at + 7]
         return root[:3], quat_multiply(root[3:], quat_conjugate(self.data.mocap_quat[0]))
 
-    def _result(self, rollout: LiftTest, outcome: Outcome) -> LiftTest:
+    def _result(self, rollout: LiftResult, outcome: Outcome) -> LiftResult:
         rollout.steps, rollout.margin = self._steps, self._excess()
         rollout.outcome = _OUTCOMES[outcome]
         return rollout

@@ -57,7 +57,7 @@ DEEP: Final = 20.0  # score of grasps that start in deep penetration
 Frictions = tuple[Scene, Scene]  # scenes compiled at half and at full friction; everything else is the same
 
 
-class LiftRollout(Lift):
+class ShortLiftTest(Lift):
     """Short lifts of grasps in one scene. Not thread-safe."""
 
     def __init__(self, scenes: Frictions, placed: PlacedGrasps) -> None:
@@ -90,7 +90,7 @@ class LiftRollout(Lift):
         return self._extrapolate(HANGING, enough)
 
 
-class PushRollout(Test):
+class ShortPushTest(Test):
     """Short pushes of grasps of a free object. Not thread-safe."""
 
     def __init__(self, scenes: Frictions) -> None:
@@ -150,10 +150,10 @@ class ShortTests:
                 self._scenes = half, full
         scenes, least = self._scenes, np.full(len(grasps), np.inf) if beat is None else beat
 
-        def make() -> LiftRollout | PushRollout:
-            return PushRollout(scenes) if placed is None else LiftRollout(scenes, placed)
+        def make() -> ShortLiftTest | ShortPushTest:
+            return ShortPushTest(scenes) if placed is None else ShortLiftTest(scenes, placed)
 
-        def score(test: LiftRollout | PushRollout, row: int) -> float:
+        def score(test: ShortLiftTest | ShortPushTest, row: int) -> float:
             return test.score(grasps, row, float(least[row]))
 
         return np.array(evaluate_rows(range(len(grasps)), make, score, threads=self.threads, name="short-test"), float)
@@ -167,7 +167,7 @@ LOADING_S: Final = 0.04
 LOADS: Final = 5
 
 
-class FixedRootScene(Lift):
+class FixedRootTest(Lift):
     """Tests in a scene with a fixed root: the hand closes, and the object hangs. Not thread-safe."""
 
     def _closed(self, grasps: GraspSet, row: int) -> bool:

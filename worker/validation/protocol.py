@@ -241,12 +241,12 @@ class Test:
         mujoco.mju_rotVecQuat(turned, self.scene.centre, self.data.qpos[at + 3 : at + 7])
         return np.asarray(self.data.qpos[at : at + 3] - turned)
 
-    def _turned(self) -> Floats:
+    def _rotation(self) -> Floats:
         at = self.scene.object_qpos
         return np.asarray(self.data.qpos[at + 3 : at + 7])
 
     def _motion(self) -> tuple[float, float]:
-        q = self._turned()
+        q = self._rotation()
         turned = 2 * math.atan2(math.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2), abs(q[0]))
         return float(np.linalg.norm(self._offset())), turned
 

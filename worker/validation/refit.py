@@ -13,7 +13,7 @@ from typing import Final, Literal
 import numpy as np
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert, quat_from_matrix
-from graspd.worker.hands.collisions import resting_neighbours
+from graspd.worker.hands.collisions import collision_exempt_pairs
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.primitives import hull, sample, signed_distance, tessellate, volume
 
@@ -39,10 +39,10 @@ def refit_hand(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
     if len(pieces) == len(hand.pieces) and all(a is b for a, b in zip(pieces, hand.pieces, strict=True)):
         return hand
     other = replace(hand, pieces=pieces)
-    return replace(other, neighbours=hand.neighbours | resting_neighbours(other))
+    return replace(other, neighbours=hand.neighbours | collision_exempt_pairs(other))
 
 
-def fits_of(hand: HandModel) -> frozenset[Fit]:
+def applicable_fits(hand: HandModel) -> frozenset[Fit]:
     links = {(piece.body, piece.link) for piece in hand.pieces}
     found: set[Fit] = set()
     if len(links) < len(hand.pieces):
@@ -133,14 +133,14 @@ def _primitive_like(piece: ConvexPiece, kind: str) -> ConvexPiece:
     size = {
         "box": tuple(float(side) for side in np.sqrt(12 * spread)),
         "cylinder": (radius, math.sqrt(12 * float(spread[2]))),
-        "capsule": _capsule(solid, across),
+        "capsule": _capsule_size(solid, across),
     }[kind]
     scale = (solid / volume(kind, size, *tessellate(kind, size))) ** (1 / 3)
     pose = np.concatenate([centre, quat_from_matrix(axes)])
     return _primitive(piece, kind, tuple(scale * side for side in size), pose)
 
 
-def _capsule(solid: float, across: float) -> tuple[float, float]:
+def _capsule_size(solid: float, across: float) -> tuple[float, float]:
     """Return radius and length of a capsule of a volume [m^3] and a variance across its axis [m^2].
     The variance is r^2 (1 / 4 - s / 20), where s is the caps' share of the volume: 1 for a ball. The solution iterates,
     since s grows with r^3 and has little effect on r."""
@@ -170,7 +170,7 @@ def _offset(vertices: Floats, by_m: float) -> Floats:
     normals = np.unique(np.round(solid.equations[:, :3], 9), axis=0)
     inside = points.mean(axis=0)
     if by < 0:
-        inside, depth = _deepest(solid.equations)
+        inside, depth = _largest_ball(solid.equations)
         by = max(by, -_LEFT * depth)
     else:
         corner = np.zeros_like(points)
@@ -184,7 +184,7 @@ def _offset(vertices: Floats, by_m: float) -> Floats:
     return np.asarray(found * scale + vertices.mean(axis=0))
 
 
-def _deepest(planes: Floats) -> tuple[Floats, float]:
+def _largest_ball(planes: Floats) -> tuple[Floats, float]:
     """Return centre and radius of the largest ball in a convex solid of unit planes (F, 4): n x + b <= 0."""
     from scipy.optimize import linprog
 

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.metrics import ROBUST_MODELS, Axis
+from graspd.service.model.metrics import ROBUST_MODELS, PerturbedParameter
 from graspd.service.model.transforms import Floats
 from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
 from graspd.worker.grasps import GraspSet
@@ -57,15 +57,15 @@ class Robustness:
         """(N,) `Axis` of the first model in which a grasp does not hold; 0 if it holds in all."""
         failed = self.held == 0
         first = failed.argmax(axis=1)
-        return np.where(failed.any(axis=1), self.axis[np.arange(len(first)), first], np.uint8(Axis.NONE))
+        return np.where(failed.any(axis=1), self.axis[np.arange(len(first)), first], np.uint8(PerturbedParameter.NONE))
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
         return {"quality/robust_share": self.share, "quality/robust_weakest": self.weakest}
 
-    def by_axis(self) -> dict[Axis, tuple[int, int]]:
+    def by_axis(self) -> dict[PerturbedParameter, tuple[int, int]]:
         """Return the number of models in which a grasp held, and of all models, for each validated axis."""
-        validated = {axis: self.held[(self.axis == axis) & (self.held != NOT_VALIDATED)] for axis in Axis}
+        validated = {axis: self.held[(self.axis == axis) & (self.held != NOT_VALIDATED)] for axis in PerturbedParameter}
         return {axis: (int(held.sum()), len(held)) for axis, held in validated.items() if len(held)}
 
 
@@ -123,7 +123,7 @@ def validate_robustness(
         return around.lift(grasps, row, placed, variant, dexgraspbench=level == "dexgraspbench").success
 
     def work(row: int) -> None:
-        for k, (axis, variant) in enumerate(models_of(hand, grasps, row, models, seed)):
+        for k, (axis, variant) in enumerate(draw_models(hand, grasps, row, models, seed)):
             run.check("robustness")
             axes[row, k] = axis
             verdicts[row, k] = holds(row, variant)
@@ -137,7 +137,9 @@ def validate_robustness(
     return Robustness(verdicts, axes, wanted, time.perf_counter() - began)
 
 
-def models_of(hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int) -> list[tuple[Axis, Variant]]:
+def draw_models(
+    hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int
+) -> list[tuple[PerturbedParameter, Variant]]:
     """Return the axis and the variant of each model in which one grasp is validated."""
     whole = hashlib.sha256()
     for part in (grasps.pregrasp, grasps.grasp, grasps.squeeze):

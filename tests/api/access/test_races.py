@@ -18,7 +18,7 @@ from graspd.service.model.errors import QuotaError
 from graspd.service.model.records import JobRecord, ObjectSet, object_set_of
 from graspd.service.model.webhooks import MOST_HOOKS
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.datasets.actions import DatasetRounds
+from graspd.service.pipeline.datasets.actions import DatasetController
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
 from graspd.service.store import library
@@ -232,7 +232,7 @@ def test_of_two_cancellations_at_once_one_counts(twins: list[TestClient], servic
 
 def test_two_snapshots_at_once_are_one(twins: list[TestClient], services: Services) -> None:
     twins[0].post("/v1/datasets", json=MATRIX | {"name": "all"})
-    DatasetRounds(services).advance()
+    DatasetController(services).advance()
     job = next(services.store.list("jobs")).key
     finish_all(services, read_record(JobRecord, services.store, job))
     answers = at_once(twins, lambda http, _: http.post("/v1/datasets/all/snapshots"))

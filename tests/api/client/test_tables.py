@@ -125,6 +125,6 @@ def test_a_report_names_the_standing_of_what_it_counts(services: Services, valid
     validated = "not validated" if validation == "none" else "at"
     assert f"per {word} grasp" in out.getvalue() and f"{made}/32 {validated}" in out.getvalue()
     assert not re.search(rf"\b{other}\b", out.getvalue())
-    assert JobOptions(want="candidates", validation="none").standing == "kept"
+    assert JobOptions(want="candidates", validation="none").displayed_status == "kept"
     reasons = [line for line in out.getvalue().splitlines() if line.startswith("reason: ")]
     assert reasons == ([] if validation == "none" else [f"reason: {dataset.reason}"])

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from graspd.api.catalog.datasets import Datasets, Pair
+from graspd.api.catalog.datasets import CellPair, Datasets
 from graspd.api.dashboard.figures import service_grid
 from graspd.service.index.queries.grasps import GraspFilter
 from graspd.service.index.views import MatrixCell
@@ -92,7 +92,7 @@ def test_a_dataset_is_made_in_scenes_with_neighbours(http: TestClient, services:
     form = {"name": "clutter", "grasps": "32", "hands": ["allegro"], "objects": ["mug"], "neighbours": "block, bottle"}
     page = http.post("/datasets", data=form | {"scene": "table"}).text
     assert "on a table with neighbours block, bottle" in page
-    assert [one.object for one in services.index.datasets.get("clutter").options.beside] == ["block", "bottle"]
+    assert [one.object for one in services.index.datasets.get("clutter").options.all_neighbours] == ["block", "bottle"]
     wrong = http.post("/datasets", data=form | {"name": "afloat"})
     assert wrong.status_code == 422 and "neighbours need a scene" in wrong.text
     assert 'value="block, bottle"' in wrong.text and 'value="afloat"' in wrong.text, "what was typed stays"
@@ -220,4 +220,4 @@ def test_more_cells_than_anybody_reads_are_left_out(services: Services, monkeypa
     _two(services)
     monkeypatch.setattr("graspd.api.catalog.datasets.MOST_CELLS", 1)
     datasets = Datasets(services, None)  # type: ignore[arg-type]
-    assert datasets.compare("rough", "fine").pairs == [] and Pair("hand", "object", None, None).gain is None
+    assert datasets.compare("rough", "fine").pairs == [] and CellPair("hand", "object", None, None).gain is None

@@ -276,4 +276,4 @@ def test_an_address_that_may_not_be_reached_is_given_up_at_once(services: Servic
     end_jobs_of(services, "a", "2")
     ear.answer = Response(None, "the address is not public", is_final=True)
     assert ear.round() == 1 and ear.round(10 * WAITS_S[-1]) == 0
-    assert {one.state for one in services.index.outbox.log(f"a{0:031}")} == {"failed"}
+    assert {one.state for one in services.index.outbox.delivery_log(f"a{0:031}")} == {"failed"}

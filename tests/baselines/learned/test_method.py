@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from graspd.baselines.learned import network as net
-from graspd.baselines.learned.method import ELEVATION, NEAREST_M, RETREATS, Seeds, SurfaceView
+from graspd.baselines.learned.method import ELEVATION, NEAREST_M, RETREATS, NetworkStarts, SurfaceView
 from graspd.baselines.learned.network import Proposals, encode, save
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import resolve_fidelity
@@ -99,7 +99,7 @@ def proposing(network: ProposalNetwork, found: Proposals, anchor: np.ndarray) ->
 def started(pair: Pair, network: ProposalNetwork, height: float, placed: PlacedGrasps) -> HandState:
     """Clear starts, two a grasp, from a network that proposes a palm at a height above the anchor [m]."""
     hand, obj, each = pair.hand.model, pair.coarse.obj.model, 2
-    seeds = Seeds(proposing(network, down(hand, height), np.zeros(3)), each)
+    seeds = NetworkStarts(proposing(network, down(hand, height), np.zeros(3)), each)
     obstacles = DeviceObstacles.create(hand, placed.scenes, obj.centre_of_mass, "cpu")
     model = pair.model(pair.coarse, obstacles)
     generators = [start_generator(0, 0, i, k) for i in range(len(placed.index)) for k in range(each)]

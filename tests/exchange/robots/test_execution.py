@@ -10,13 +10,20 @@ import trimesh
 
 from graspd.exchange.inputs import load_case
 from graspd.exchange.robots import execution
-from graspd.exchange.robots.execution import POSTURES, Executions, executions, straight_paths, time_motions, tool_frame
+from graspd.exchange.robots.execution import (
+    POSTURES,
+    Executions,
+    build_executions,
+    straight_paths,
+    time_motions,
+    tool_frame,
+)
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, apply, compose, invert, slerp
 from graspd.service.store.shards import read_shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.model import MujocoOptions, build
+from graspd.worker.validation.model import MujocoOptions, build_scene
 from graspd.worker.validation.protocol import Test as Rollout
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import grasp_set, posture
@@ -29,7 +36,7 @@ def of_shard(file: Path) -> Executions:
     case = load_case(file)
     given = {"rows": np.arange(len(case.grasps)), "placed": case.placed, "tool": TOOL}
     quality = {"valid": read_shard(file, kind="base")["quality/valid"]}
-    return executions(case.hand, case.obj, case.grasps, **given, quality=quality)
+    return build_executions(case.hand, case.obj, case.grasps, **given, quality=quality)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +52,7 @@ def test_a_free_grasp_is_reached_and_left_over_ten_centimetres(free: Executions)
 
 def test_open_hand_touches_nothing_of_a_free_object_on_its_way(free: Executions) -> None:
     """MuJoCo is the oracle: its convex pieces of the object stand out from the surface by up to 2 mm."""
-    rollout = Rollout(build(free.hand, free.obj, decompose(free.obj), MujocoOptions()))
+    rollout = Rollout(build_scene(free.hand, free.obj, decompose(free.obj), MujocoOptions()))
     assert len(free) >= 4
     for start, end in (("standoff", "arrival"), ("arrival", "pregrasp")):
         a, b = free.postures[start], free.postures[end]
@@ -67,7 +74,7 @@ def test_grasps_without_a_free_way_are_left_out_none_is_refused() -> None:
     ball = object_from_mesh(trimesh.util.concatenate([shell, inner]))
     caught = grasp_set(posture(((0.0, 0, 0), (0.0, 0.0))))
     with pytest.raises(InputError, match="free of the object"):
-        executions(hand, ball, caught, rows=np.zeros(1, int), placed=None, tool=TOOL, quality={})
+        build_executions(hand, ball, caught, rows=np.zeros(1, int), placed=None, tool=TOOL, quality={})
 
 
 def test_in_scene_ways_of_shard_are_kept_in_frame_of_the_scene(table_shard: Path) -> None:
@@ -130,7 +137,7 @@ def test_trajectories_stay_within_limits_and_reach_every_posture(free: Execution
 
 def test_limits_are_those_of_the_hand_or_assumed(free: Executions) -> None:
     hand = replace(free.hand, velocity=np.concatenate([[3.0], np.zeros(free.hand.dofs - 1)]))
-    found = execution.hand_limits(hand)
+    found = execution.velocity_limits(hand)
     leads = hand.dof[hand.joint_body] == 0
     np.testing.assert_allclose(found.velocity[leads], 3.0 * np.abs(hand.multiplier[hand.joint_body][leads]))
     assert (found.velocity[~leads] == execution.ASSUMED_RAD_S).all()

@@ -18,9 +18,9 @@ DAY, NEXT = "2026-11-20", "2026-11-21"
 
 def enter(services: Services, project: str, seed: int, *, key: str = "", batches: int = 1, where: int = 0) -> JobRecord:
     """A bulk job of a project, none of it in the queue; `where` is the first digit of its id."""
-    record = job_actions.prepare(services, request(grasps=32 * batches, seed=seed), priority=Priority.BULK).model_copy(
-        update={"id": f"{where:x}{seed:031x}", "origin": Origin(key=key or project), "project": project}
-    )
+    record = job_actions.prepare_job(
+        services, request(grasps=32 * batches, seed=seed), priority=Priority.BULK
+    ).model_copy(update={"id": f"{where:x}{seed:031x}", "origin": Origin(key=key or project), "project": project})
     put_record(services.store, names.job_record_key(record.id), record)
     services.index.write.add_job(record)
     return record

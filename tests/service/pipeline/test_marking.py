@@ -52,10 +52,10 @@ def in_service(folder: Path, act: Callable[[Services], object] = lambda services
     """A controller starts, a user does something, the controller stops; how the index then differs from the store."""
     with closing(open_services(Settings(data_dir=folder))) as services:
         working = controller.Controller(services)
-        working.round()
+        working.run_round()
         add_assets(services)
         act(services)
-        working.round()
+        working.run_round()
         stop = threading.Event()
         stop.set()
         working.run(stop)
@@ -130,11 +130,11 @@ def test_an_index_exchanged_meanwhile_is_made_anew(tmp_path: Path, rebuilt: list
     in_service(data, submit(2))
     services = open_services(Settings(data_dir=data))
     working = controller.Controller(services)
-    working.round()
+    working.run_round()
     for file in data.glob("index.sqlite*"):
         file.unlink()
     copy_index(backup, data)
-    working.round()
+    working.run_round()
     assert len(services.index.jobs.page().items) == 2
     services.close()
 

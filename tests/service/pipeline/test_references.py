@@ -101,7 +101,7 @@ def test_what_is_named_is_needed_until_its_users_are_deleted(services: Services,
     delete_asset(services, named.kind, named.name)
     with pytest.raises(NotFoundError, match=f"there is no {named.kind.value} {named.name!r}"):
         named.submit(services)
-    while GarbageCollector(services).advance():
+    while GarbageCollector(services).execute_deletions():
         pass
     assert not list(services.store.list(f"{names.ASSETS}/network"))
 
@@ -109,7 +109,7 @@ def test_what_is_named_is_needed_until_its_users_are_deleted(services: Services,
 @BOTH
 def test_a_job_entered_while_it_is_deleted_is_not_kept(services: Services, named: Reference) -> None:
     named.add(services)
-    record = job_actions.prepare(services, request(**named.options))
+    record = job_actions.prepare_job(services, request(**named.options))
     delete_asset(services, named.kind, named.name)
     with pytest.raises(NotFoundError, match=rf"{named.kind.value} .* deleted just now"):
         job_actions.enter_job(services, record)
@@ -167,7 +167,7 @@ def test_a_forged_entry_needs_a_digest(services: Services, named: Reference, for
 def test_other_neighbours_or_another_order_are_other_scenes(services: Services, other: tuple[str, ...]) -> None:
     cup = add_cup(services)
     known = NEIGHBOUR.submit(services, neighbours=("cup", "ball"))
-    assert [one.digest for one in known.request.place.neighbours] == [cup, known.object_digest]
+    assert [one.digest for one in known.request.scene_spec.neighbours] == [cup, known.object_digest]
     assert next(plan_tasks(NEIGHBOUR.submit(services, neighbours=other))).output != next(plan_tasks(known)).output
 
 
@@ -175,7 +175,7 @@ def test_a_document_places_its_neighbours(services: Services) -> None:
     cup = add_cup(services)
     places = [{"object": "cup", "pose": [0.2, 0, 0, *UPRIGHT]}, {"object": "cup", "pose": [-0.2, 0, 0, *UPRIGHT]}]
     scene = {"supports": [FLOOR], "target": [0, 0, 0, *UPRIGHT], "neighbours": places}
-    found = NEIGHBOUR.submit(services, scene=scene, neighbours=()).request.place.neighbours
+    found = NEIGHBOUR.submit(services, scene=scene, neighbours=()).request.scene_spec.neighbours
     assert [one.pose and one.pose[0] for one in found] == [0.2, -0.2]
     assert {one.digest for one in found} == {cup}
 

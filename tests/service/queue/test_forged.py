@@ -14,7 +14,7 @@ from rq import Callback, Queue, Retry
 from rq.job import Job
 from rq.serializers import DefaultSerializer, JSONSerializer
 
-from graspd.api.metrics import Metrics, Snapshot
+from graspd.api.metrics import Metrics, MetricsSnapshot
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import TaskRefused, UnavailableError
 from graspd.service.model.states import Stage, State
@@ -22,7 +22,7 @@ from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
 from graspd.service.pipeline.leading import PART
-from graspd.service.queue.entries import TASK_FUNCTION, checked_job
+from graspd.service.queue.entries import TASK_FUNCTION, sanitized_job
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, worker_key
 from tests.fakes import beat_of, request
@@ -88,24 +88,24 @@ def test_a_forged_entry_stops_nothing(services: Services, what: str) -> None:
     now = [1000.0]
     controller = Controller(services, clock=lambda: now[0])
     queue: Any = services.queue
-    controller.round()
+    controller.run_round()
     queue.connection.zadd(WIP, {"b" * 32 + "-1:execution": 1})  # of a worker that died
     FORGERIES[what](queue.connection)
     for _ in range(8):
         now[0] += 2.0
         with contextlib.suppress(UnavailableError):  # a round may find a part out of order; it puts that right
-            controller.round()
-    controller.round()
+            controller.run_round()
+    controller.run_round()
     job, _ = job_actions.submit(services, request())
     (task,) = services.index.jobs.tasks(job=job.id).items
-    assert task.id in queue.waiting(), "feeding goes on"
+    assert task.id in queue.waiting_tasks(), "feeding goes on"
     assert queue.leases() == [], "what nobody holds is taken off"
     queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id=task.id, stage=Stage.SYNTHESIZE))
-    controller.round()
+    controller.run_round()
     assert services.index.jobs.get(job.id).state is State.RUNNING, "events are read"
     queue.discard([task.id])
-    assert task.id not in queue.waiting()
-    page = Snapshot()
+    assert task.id not in queue.waiting_tasks()
+    page = MetricsSnapshot()
     page.add_queue(queue.status(lease_s=6), is_kept=queue.is_announced(PART))
     page.add_sums(queue.counter_sums())
     assert b"graspd_workers" in Metrics().render(page)
@@ -120,7 +120,7 @@ def forge(queue: RqQueue, function: str, *args: Any, serializer: Any = JSONSeria
 
 def fetch(queue: RqQueue, job: str) -> Job:
     bulk = Queue("bulk-synthesize", connection=queue.connection, serializer=JSONSerializer)
-    return checked_job(Job.fetch(job, connection=queue.connection, serializer=JSONSerializer), bulk)
+    return sanitized_job(Job.fetch(job, connection=queue.connection, serializer=JSONSerializer), bulk)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.pinhole import pixel_rays
-from graspd.service.readers.depth_noise import NOISES, DepthNoise, noise_of, shadows
+from graspd.service.readers.depth_noise import NOISES, DepthNoise, noise_of, shadow_mask
 
 WIDTH, HEIGHT = 320, 240
 K = np.array([[330.0, 0, 160], [0, 330.0, 120], [0, 0, 1]])
@@ -65,7 +65,7 @@ def test_what_the_second_eye_does_not_see_is_a_hole() -> None:
     depth = plane(0.8)
     depth[60:180, 140:200] = 0.4
     product = 330 * 0.048  # disparities of 19.8 and 39.6 px
-    hidden = shadows(depth, product)
+    hidden = shadow_mask(depth, product)
     wall, board = product / 0.8, product / 0.4
     rows = hidden[60:180]
     assert rows[:, 140:200].sum() == 0

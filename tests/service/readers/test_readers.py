@@ -39,7 +39,7 @@ def folder(services: Services, shards: Shards, tmp_path: Path) -> Path:
 def test_a_job_in_a_store_is_read_valid_or_whole(services: Services, shards: Shards) -> None:
     assert [file.kind for file in shards] == ["base", "scene", "views"] * 2
     assert len(Grasps(shards, valid=False)) == GRASPS
-    bases = [read_shard(services.store.get(file.key), kind="base") for file in shards.of("base")]
+    bases = [read_shard(services.store.get(file.key), kind="base") for file in shards.of_kind("base")]
     valid = sum(int(np.count_nonzero(base["quality/valid"])) for base in bases)
     assert 0 < valid < GRASPS
     assert len(Grasps(shards)) == valid
@@ -110,7 +110,7 @@ def test_every_picture_is_there_once(folder: Path) -> None:
     places = {(sample["shard_id"], sample["row"]) for sample in pictures}
     assert len(places) == len(pictures) == 2 * 2 * 2  # batches, scenes, views
     with pytest.raises(NotFoundError, match="not among"):
-        Pictures(Shards(shards.of("views")))
+        Pictures(Shards(shards.of_kind("views")))
 
 
 def test_the_newest_snapshot_of_a_dataset_is_read(services: Services, shards: Shards, tmp_path: Path) -> None:
@@ -133,7 +133,7 @@ def test_a_file_that_changed_is_refused_or_fetched_again(services: Services, sha
 
 
 def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> None:
-    file = open_shards(folder).of("base")[0]
+    file = open_shards(folder).of_kind("base")[0]
     assert file.path is not None
     data = file.path.read_bytes()
     file.path.write_bytes(flipped_values(data, read_shard(data)["grasp/hand_pose"]))
@@ -168,7 +168,7 @@ def test_what_was_read_once_from_s3_needs_the_server_no_more(s3_url: str, s3_ser
 def test_every_row_of_every_column_is_what_h5py_reads(box: Path) -> None:
     with h5py.File(box / "views.h5") as file:
         columns = [name for name in SCHEMAS["views"] if name in file]
-        table = RowTable.of(file, columns, "views")
+        table = RowTable.from_file(file, columns, "views")
         assert {"image/rgb", "image/depth"} <= set(table.packed) and "camera/eye" in table.held
         for row in range(len(file["camera/eye"])):
             found = table.row(box / "views.h5", row, columns)
@@ -190,7 +190,7 @@ def test_what_is_packed_in_another_way_is_read_by_the_library(tmp_path: Path) ->
         half = file.create_dataset("half", shape=values.shape, dtype="f4", **plain)
         half[1] = values[1]
     with h5py.File(tmp_path / "other.h5") as file:
-        table = RowTable.of(file, [*ways, "half"], "other")
+        table = RowTable.from_file(file, [*ways, "half"], "other")
     assert set(table.packed) == {"plain"}
     found = table.row(tmp_path / "other.h5", 1, ways)
     for name in ways:
@@ -203,7 +203,7 @@ def test_a_picture_whose_bytes_changed_is_refused_alone(box: Path, tmp_path: Pat
     shutil.copytree(box, tmp_path / "set")
     pictures, path = Pictures(open_shards(tmp_path / "set"), ["image/depth"]), tmp_path / "set" / "views.h5"
     with h5py.File(path) as file:
-        start, length = RowTable.of(file, ["image/depth"], "views").packed["image/depth"].places[2]
+        start, length = RowTable.from_file(file, ["image/depth"], "views").packed["image/depth"].places[2]
     data = bytearray(path.read_bytes())
     data[start + length // 2] ^= 0x10
     pictures[1]

@@ -8,11 +8,11 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import quat_from_axis_angle
 from graspd.service.readers.trajectories import (
     Waypoint,
-    point_at,
     scene_spec_of,
     slider_positions,
     trajectory_of,
-    wrists_of,
+    waypoint_at,
+    wrist_angles,
 )
 from graspd.service.store.shards import Shard, json_attribute
 
@@ -43,13 +43,13 @@ def test_a_way_goes_from_standoff_or_pregrasp_to_lift_or_squeeze():
     assert all((point.joint_positions == -0.3).all() for point in way[:WAYPOINTS])
     assert way[-1].carried.tolist() == [0, 0, 0.1] and not any(point.carried.any() for point in way[:-1])
     np.testing.assert_allclose(slider_positions(way), [0, 0.25, 0.5, 0.75, 1, 2, 3, 4])
-    assert point_at(way, 3.5).carried == pytest.approx([0, 0, 0.05]), "half way up"
+    assert waypoint_at(way, 3.5).carried == pytest.approx([0, 0, 0.05]), "half way up"
 
 
 @pytest.mark.parametrize("at", [(-1, 0.2, -0.3), (0.375, 0.15, -0.3), (1.5, 0.1, 0.05), (9, 0.1, 0.2)])
 def test_between_two_postures_positions_and_joints_go_straight(at: tuple[float, float, float]):
     place, x, joint = at
-    point = point_at(trajectory_of(shard(in_scene=True), 0), place)
+    point = waypoint_at(trajectory_of(shard(in_scene=True), 0), place)
     assert point.hand_pose[0] == pytest.approx(x) and point.joint_positions == pytest.approx([joint, joint])
 
 
@@ -59,7 +59,7 @@ def test_a_turn_is_divided_evenly():
         Waypoint(name, np.concatenate([np.zeros(3), q]), np.zeros(0), np.zeros(3))
         for name, q in zip(("grasp", "squeeze"), ends, strict=True)
     )
-    third = point_at([first, last], 1 / 3).hand_pose[3:]
+    third = waypoint_at([first, last], 1 / 3).hand_pose[3:]
     assert third == pytest.approx(quat_from_axis_angle(np.array([0, 0, 1.0]), np.array(0.4)))
 
 
@@ -73,6 +73,6 @@ def test_a_shard_says_its_scene_or_none_and_nonsense_is_refused():
 
 def test_wrists_are_those_of_the_rows_asked_for():
     one = shard(in_scene=True)
-    assert wrists_of(one, np.array([0])) is None
+    assert wrist_angles(one, np.array([0])) is None
     one.arrays["grasp/wrist_positions"] = np.array([[0.1, 0.2], [0.3, 0.4]])
-    assert np.array_equal(wrists_of(one, np.array([1, 1])), [[0.3, 0.4]] * 2)
+    assert np.array_equal(wrist_angles(one, np.array([1, 1])), [[0.3, 0.4]] * 2)

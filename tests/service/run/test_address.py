@@ -13,7 +13,7 @@ import pytest
 
 from graspd.client.reports import open_client
 from graspd.service.model.errors import InputError, UnavailableError
-from graspd.service.run.address import bind, forget_address, new_listen_address, record_address, recorded_address
+from graspd.service.run.address import bind_socket, forget_address, new_listen_address, record_address, recorded_address
 from graspd.service.run.children import Child, kill_leftovers, start_time
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
@@ -80,12 +80,12 @@ def test_a_service_on_any_free_port_is_found_until_it_stops(folder: Path) -> Non
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a second socket of one address is refused there")
 def test_a_port_that_was_found_free_is_kept_for_the_api() -> None:
-    with bind("127.0.0.1", 0) as reserved, socket.socket() as stranger:
+    with bind_socket("127.0.0.1", 0) as reserved, socket.socket() as stranger:
         address = reserved.getsockname()
         with pytest.raises(OSError, match="in use"):
             stranger.bind(address)
         for _ in range(2):  # an API that is started again takes it again
-            with bind(*address) as listener:
+            with bind_socket(*address) as listener:
                 listener.listen()
 
 

@@ -62,7 +62,7 @@ def test_another_number_of_database_is_another_redis(first: Services, redis_serv
     empty_index(settings.resolved_index_url).close()
     second = Services.open(settings)
     second.queue.connection.flushdb()
-    assert identify(second) != first.queue.service()
+    assert identify(second) != first.queue.service_id()
     second.close()
 
 
@@ -77,10 +77,10 @@ def test_store_and_index_lie_in_the_folder_and_nothing_beside_it(name: str, tmp_
     assert [(entry.key, store.get(entry.key)) for entry in store.list("jobs")] == [("jobs/one/job.json", b"{}")]
     assert (settings.data_dir / "store" / "jobs" / "one" / "job.json").exists()
     index = Index(settings.resolved_index_url)
-    index.notes.name_service("one")
+    index.notes.set_service_id("one")
     index.close()
     again = Index(settings.resolved_index_url)
-    assert again.notes.service() == "one"
+    assert again.notes.service_id() == "one"
     again.close()
     assert (settings.data_dir / "index.sqlite").exists()
     assert [path.name for path in tmp_path.iterdir()] == [name]
@@ -92,7 +92,7 @@ def test_a_whole_service_gets_ready_in_an_odd_folder(tmp_path: Path) -> None:
     with Supervisor(settings, workers=0) as supervisor:
         assert supervisor.wait_ready(PATIENCE_S)
         services = Services.open(supervisor.settings)
-        assert services.queue.service() == services.index.notes.service()
+        assert services.queue.service_id() == services.index.notes.service_id()
         services.close()
     assert [path.name for path in tmp_path.iterdir()] == [name]
 

@@ -9,7 +9,7 @@ from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats, quat_from_axis_angle, quat_multiply, quat_rotate
 from graspd.service.store.asset_summary import summary
 from graspd.worker.hands.check import check_hand
-from graspd.worker.hands.jaws import fingertip_pad, sign_of
+from graspd.worker.hands.jaws import dominant_sign, fingertip_pad
 from graspd.worker.hands.model import HandModel
 from tests.worker.hands.urdfs import joint, limits, link, load, report, robot
 
@@ -176,7 +176,11 @@ def test_rounding_turns_neither_palm_nor_jaws_nor_closing() -> None:
         np.testing.assert_allclose(load(claw(3, TURNS["upright"], noise=noise)).palm.approach, [0, 0, 1], atol=1e-9)
     for noise in (1e-17, -1e-17):
         line = np.array([noise, 1.0, -noise])
-        assert sign_of(line) == 1 and sign_of(-line) == -1 and sign_of(np.array([1.0, -1.0 - noise, 0])) == 1
+        assert (
+            dominant_sign(line) == 1
+            and dominant_sign(-line) == -1
+            and dominant_sign(np.array([1.0, -1.0 - noise, 0])) == 1
+        )
     for lower in ("-0.7", "-0.7000001", "-0.6999999"):
         assert (load(claw(3, TURNS["upright"]).replace(b'"-0.4"', f'"{lower}"'.encode())).closing == 1).all()
 

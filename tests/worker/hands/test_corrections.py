@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from graspd.service.store.descriptions import HandCorrections, apply_corrections, facts_of
+from graspd.service.store.descriptions import HandCorrections, apply_corrections, read_hand_facts
 from graspd.worker.hands.jaws import pads_of
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
@@ -44,7 +44,7 @@ def same(one: HandModel, other: HandModel, *, palm: bool) -> bool:
 )
 def test_corrections_and_options_make_the_same_hand(said, options, palm: bool, tmp_path) -> None:
     (tmp_path / "claw.urdf").write_bytes(CLAW)
-    facts = facts_of(hand_glb(hand_from_path(tmp_path / "claw.urdf")))
+    facts = read_hand_facts(hand_glb(hand_from_path(tmp_path / "claw.urdf")))
     there = apply_corrections({"file": "claw.urdf"}, facts, HandCorrections.model_validate(said))
     named = load_hand({"claw.urdf": CLAW, "asset.json": json.dumps(there).encode()}, name="claw", digest="")
     written = tmp_path / "asset.json"
@@ -58,7 +58,7 @@ def test_corrections_and_options_make_the_same_hand(said, options, palm: bool, t
 def test_a_corrected_approach_is_a_direction_and_no_more() -> None:
     hand = load_hand({"claw.urdf": CLAW}, name="claw", digest="")
     said = HandCorrections.model_validate({"palm": {"link": "palm", "approach": [0, 2, 0]}})
-    there = apply_corrections({"file": "claw.urdf", "approach": [1, 0, 0]}, facts_of(hand_glb(hand)), said)
+    there = apply_corrections({"file": "claw.urdf", "approach": [1, 0, 0]}, read_hand_facts(hand_glb(hand)), said)
     made = load_hand({"claw.urdf": CLAW, "asset.json": json.dumps(there).encode()}, name="claw", digest="")
     assert made.palm.approach.tolist() == [0, 1, 0] and same(made, hand, palm=False)
     assert np.allclose(made.palm.centre, hand.palm.centre, atol=2e-6)
@@ -66,7 +66,7 @@ def test_a_corrected_approach_is_a_direction_and_no_more() -> None:
 
 def test_the_model_tells_every_link_and_pads_are_where_jaws_meet() -> None:
     hand = load_hand({"claw.urdf": CLAW}, name="claw", digest="")
-    facts = facts_of(hand_glb(hand))
+    facts = read_hand_facts(hand_glb(hand))
     assert set(facts.links) == {"palm", "a", "b", "c", "mount", "tip"} and facts.bodies == ["palm", "a", "b", "c"]
     body, pose = hand.frames["tip"]
     assert hand.body_names[body] == "a" and np.allclose(pose[:3], [0, 0, 0.04])

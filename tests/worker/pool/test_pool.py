@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from graspd.service.model.errors import TaskCancelled
-from graspd.worker.engines.batch_sizes import BYTES_PER_PROCESS, PROCESS_SHARE, processes_at_once
+from graspd.worker.engines.batch_sizes import BYTES_PER_PROCESS, PROCESS_SHARE, pool_process_count
 from graspd.worker.pool.pool import KEPT, Pool, ProcessLost
 from tests.service.model.test_cores import system
 from tests.waiting import until
@@ -110,10 +110,10 @@ def test_how_many_there_are_where_nobody_says(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 1 << 26}[name])
     room = round(BYTES_PER_PROCESS / PROCESS_SHARE)
     big = machine(tmp_path / "big", 16, 40 * room)
-    assert processes_at_once("cuda:0", 0, root=big) == 15
-    assert processes_at_once("cuda:1", 0, root=big, workers=4) == 3, "workers of one machine share its cores"
-    assert processes_at_once("cuda:0", 0, root=big, threads=5) == 4
-    assert processes_at_once("cpu", 0, root=big) == 1, "the planner takes the cores at other times"
-    assert [processes_at_once(device, 6, root=big) for device in ("cpu", "cuda:0")] == [6, 6]
-    assert processes_at_once("cuda:0", 0, root=machine(tmp_path / "two", 2, 40 * room)) == 1
-    assert processes_at_once("cuda:0", 0, root=machine(tmp_path / "poor", 16, 3 * room)) == 3
+    assert pool_process_count("cuda:0", 0, root=big) == 15
+    assert pool_process_count("cuda:1", 0, root=big, workers=4) == 3, "workers of one machine share its cores"
+    assert pool_process_count("cuda:0", 0, root=big, threads=5) == 4
+    assert pool_process_count("cpu", 0, root=big) == 1, "the planner takes the cores at other times"
+    assert [pool_process_count(device, 6, root=big) for device in ("cpu", "cuda:0")] == [6, 6]
+    assert pool_process_count("cuda:0", 0, root=machine(tmp_path / "two", 2, 40 * room)) == 1
+    assert pool_process_count("cuda:0", 0, root=machine(tmp_path / "poor", 16, 3 * room)) == 3

@@ -48,7 +48,7 @@ class Worker:
         return int(child)
 
     def events(self) -> list[EventKind]:
-        return [event.kind for _, event in self.queue.tail("0", limit=100, wait_s=0)]
+        return [event.kind for _, event in self.queue.events_after("0", limit=100, wait_s=0)]
 
     def states(self) -> list[str]:
         return [beat.state for beat in self.queue.workers()]
@@ -255,7 +255,7 @@ def test_what_a_worker_is_at_is_shown_at_once(heart: Heartbeat, rq_queue: RqQueu
 def test_a_worker_that_leaves_is_not_lost(heart: Heartbeat, rq_queue: RqQueue) -> None:
     heart.stop()
     assert rq_queue.workers() == []
-    assert [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)] == [EventKind.LEFT]
+    assert [event.kind for _, event in rq_queue.events_after("0", limit=10, wait_s=0)] == [EventKind.LEFT]
 
 
 def test_it_goes_on_when_redis_answers_again(heart: Heartbeat, rq_queue: RqQueue) -> None:

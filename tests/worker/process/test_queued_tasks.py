@@ -36,7 +36,7 @@ def work(rq_queue, redis_server: str, tmp_path):
 
 @pytest.fixture
 def kinds(rq_queue):
-    return lambda: [event.kind for _, event in rq_queue.tail("0", limit=100, wait_s=0)]
+    return lambda: [event.kind for _, event in rq_queue.events_after("0", limit=100, wait_s=0)]
 
 
 def _waits(redis: Any, entry: str | bytes) -> None:
@@ -110,7 +110,7 @@ def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue, work, kinds)
         rq_queue.connection.config_set("min-replicas-to-write", replicas)
 
     def stage(message: TaskMessage, context: TaskContext):
-        until(lambda: rq_queue.tail("0", limit=1, wait_s=0), "it was told that the task began")
+        until(lambda: rq_queue.events_after("0", limit=1, wait_s=0), "it was told that the task began")
         refuse(1)
         threading.Timer(1.0, refuse, [0]).start()
         return fake_synthesize(message, context)

@@ -206,13 +206,13 @@ def test_a_box_has_six_planes_however_it_is_triangulated() -> None:
 @pytest.fixture
 def computed(own_cache, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
     shapes: list[tuple[int, ...]] = []
-    sampled = grids._sampled
+    sampled = grids._sample_field
 
     def watched(skin, shape: tuple[int, ...]):
         shapes.append(shape)
         return sampled(skin, shape)
 
-    monkeypatch.setattr(grids, "_sampled", watched)
+    monkeypatch.setattr(grids, "_sample_field", watched)
     return shapes
 
 
@@ -238,7 +238,7 @@ def test_another_cell_faces_or_binary_is_another_grid(computed: list, monkeypatc
     kept_grid()
     coarse = kept_grid(cell=0.01)
     kept_grid(alpha=1.0)
-    monkeypatch.setattr(grids, "binary_name", lambda module: "that of another processor")
+    monkeypatch.setattr(grids, "binary_identity", lambda module: "that of another processor")
     kept_grid()
     assert len(computed) == 4 and coarse["field"].size < kept_grid()["field"].size
 
@@ -261,7 +261,7 @@ def test_another_cell_faces_or_binary_is_another_grid(computed: list, monkeypatc
 def test_an_entry_that_would_lead_kernels_astray_is_made_again(computed, own_cache, name: str, change) -> None:
     first = kept_grid()
     (file,) = own_cache.rglob("object_grids/*")
-    arrays = disk_cache._read(file)
+    arrays = disk_cache._read_records(file)
     array = arrays.pop(name)
     disk_cache._write(file, arrays | ({name: change(array)} if change else {}))
     for _ in range(2):  # the second time the entry is whole again

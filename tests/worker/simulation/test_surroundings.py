@@ -94,7 +94,7 @@ def test_many_hands_have_the_room_of_each_ones_scene(name: str) -> None:
     one, other = Obstacle.half_space([0.3, -0.5, 0.8], -0.1), Obstacle.half_space([0, 1, 0], 0.05)
     up, which = np.array([0.0, 0, 1]), np.arange(9) % 3
     scenes = [Environment((one,), up), Environment((one, other), up), Environment((), up)]
-    posed = PosedFeatures.of(hand, postures)
+    posed = PosedFeatures.create(hand, postures)
     wanted = np.full(9, np.inf)
     for number, around in enumerate([[one], [one, other], []]):
         for obstacle in around:

@@ -16,7 +16,7 @@ from graspd.service.model.errors import DamagedShard, TaskCancelled
 from graspd.service.model.messages import IngestMessage
 from graspd.service.model.planning import message_of, plan_tasks
 from graspd.service.model.records import AttemptRecord, JobRecord
-from graspd.service.model.scene_spec import has_table, scene_of, supports_in
+from graspd.service.model.scene_spec import has_table, scene_of, scene_supports
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.readers import Grasps, Pictures, open_shards
@@ -163,7 +163,7 @@ def render_alone(bench: Bench, base: Shard) -> dict:
     message = message_of(bench.job, list(plan_tasks(bench.job))[-1], attempt=1, max_attempt=3)
     request, obj = bench.job.request, object_of(bench.store, message)
     options = {"views": 1, "stereo": False, "width": request.width, "height": request.height}
-    extras = Extras(supports=supports_in(request.place))
+    extras = Extras(supports=scene_supports(request.scene_spec))
     return pictures(obj, np.asarray(base["scene/object_pose"]), **options, seed=batch_seed(message), extras=extras)
 
 
@@ -344,12 +344,12 @@ def test_the_grasps_of_a_job_are_those_of_synth_with_the_file(store: Store, netw
     own = local_options("learned", {"network": str(tmp_path / "net.npz"), "starts": 2})
     assert own["network"] == digest_bytes(files[NETWORK_FILE]) != network.digest
     request = JobOptions(**LEARNED, options=own)
-    alone = synthesize_grasps("barrett", "block", request, place=request.place, scenes=2, device="cpu", threads=2)
+    alone = synthesize_grasps("barrett", "block", request, place=request.scene_spec, scenes=2, device="cpu", threads=2)
     assert set(made.arrays) == set(alone.arrays) and len(made["grasp/hand_pose"]) == 3
     for name, values in alone.arrays.items():
         np.testing.assert_array_equal(made[name], values, err_msg=name)
     without = JobOptions(**{**LEARNED, "method": "fast_graspd"})
-    other = synthesize_grasps("barrett", "block", without, place=without.place, scenes=2, device="cpu", threads=2)
+    other = synthesize_grasps("barrett", "block", without, place=without.scene_spec, scenes=2, device="cpu", threads=2)
     assert (made["grasp/hand_pose"] != other.arrays["grasp/hand_pose"]).any(), "the network is followed"
 
 
@@ -393,7 +393,7 @@ def test_a_network_whose_finding_was_lost_is_checked_by_a_worker(store: Store, n
     ],
 )
 def test_scene_is_refused_at_door_where_planner_finds_no_table(scene) -> None:
-    place = JobOptions(scene=scene).place
+    place = JobOptions(scene=scene).scene_spec
     assert place == scene_of(JobOptions(scene=scene).scene, faces="drawn", touch=0.0, beside=())
     try:
         table_height(supports_of(place))

@@ -25,7 +25,7 @@ from graspd.worker.validation import decomposition, model, protocol
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.displacement import GRAVITY, STEPS, TIMESTEP_S, simulated_displacement_cm
 from graspd.worker.validation.key import LEVEL_MOVES, MOVES, Level, verdict_key
-from graspd.worker.validation.model import MujocoOptions, blend, build, scene_of
+from graspd.worker.validation.model import MujocoOptions, blend, build_scene, scene_of
 from graspd.worker.validation.protocol import HOLD_S, MAX_DISPLACEMENT_M, MAX_ROTATION, Outcome, Rollout, Test
 from graspd.worker.validation.validator import validate
 from tests.worker.models import object_from_mesh, on_one_dof, two_finger_hand
@@ -51,11 +51,11 @@ def test_a_pressed_box_is_held_and_a_free_one_falls() -> None:
 
 def test_the_box_slips_at_friction_0_04_and_holds_at_0_06() -> None:
     # Two pads of 10 N give 0.8 N of friction against a push of 1 N across; along their normals they need none.
-    scene = build(PADS, BOX, WHOLE, MujocoOptions(friction=(0.04, 0.001)))
+    scene = build_scene(PADS, BOX, WHOLE, MujocoOptions(friction=(0.04, 0.001)))
     rollout = Test(scene).dexgraspbench(grasp_of(), 0)
     assert rollout.outcomes[:3] == [Outcome.HELD, Outcome.HELD, Outcome.DISPLACED]
     # 1.2 N of friction against 1 N.
-    scene = build(PADS, BOX, WHOLE, MujocoOptions(friction=(0.06, 0.001)))
+    scene = build_scene(PADS, BOX, WHOLE, MujocoOptions(friction=(0.06, 0.001)))
     assert Test(scene).dexgraspbench(grasp_of(), 0).success
 
 
@@ -70,7 +70,7 @@ def test_penetration_counts_at_pregrasp_where_simulation_starts(level: str) -> N
 
 
 def test_the_engine_has_the_numbers_of_hand_and_object() -> None:
-    model = build(PADS, BOX, WHOLE, MujocoOptions()).model
+    model = build_scene(PADS, BOX, WHOLE, MujocoOptions()).model
     fingers = [int(model.joint(f"joint{b}").dofadr[0]) for b in PADS.joint_body]
     assert model.dof_damping[fingers] == pytest.approx(0.02 * PADS.stiffness) and not model.dof_armature.any()
     assert not model.dof_frictionloss.any()
@@ -79,7 +79,7 @@ def test_the_engine_has_the_numbers_of_hand_and_object() -> None:
     assert body.mass[0] == pytest.approx(MASS_KG)
     assert sorted(body.inertia) == pytest.approx(sorted(MASS_KG * np.linalg.eigvalsh(BOX.inertia)), rel=1e-6)
     hand = two_finger_hand()
-    model = build(hand, BOX, WHOLE, MujocoOptions()).model
+    model = build_scene(hand, BOX, WHOLE, MujocoOptions()).model
     assert model.joint("joint1").range == pytest.approx([hand.lower[0], hand.upper[0]])
 
 
@@ -87,7 +87,7 @@ def test_the_engine_has_the_numbers_of_hand_and_object() -> None:
 def test_a_pair_of_pieces_has_one_contact_but_between_jaws(jaws: bool, contacts: int, monkeypatch) -> None:
     if not jaws:
         monkeypatch.setattr(model, "jaws_of", lambda hand: None)
-    scene = build(helpers.plate_hand(), BOX, WHOLE, MujocoOptions())
+    scene = build_scene(helpers.plate_hand(), BOX, WHOLE, MujocoOptions())
     data = placed_data(scene, CONTACT.joint_positions[0] + 1e-3, CONTACT.hand_pose[0])
     # A plate's face lies flat on the box: with multi-contact each of the two has four points.
     assert len(data.contact.dist) == contacts
@@ -97,7 +97,7 @@ def test_displacement_is_that_of_the_mesh_s_own_frame() -> None:
     mesh = trimesh.creation.box((0.06, 0.04, 0.05))
     mesh.apply_translation([0.3, 0, 0])
     far = object_from_mesh(mesh)
-    scene = build(PADS, far, ConvexPieces((far.hull_vertices,), 1.0, 0.0, "far"), MujocoOptions())
+    scene = build_scene(PADS, far, ConvexPieces((far.hull_vertices,), 1.0, 0.0, "far"), MujocoOptions())
     test = Test(scene)
     scene.place(test.data, FAR, np.zeros(2))
     assert test._motion() == (pytest.approx(0, abs=1e-12), 0)
@@ -116,19 +116,19 @@ def test_the_root_turns_at_an_even_rate_between_two_postures() -> None:
 
 
 def test_push_from_the_saved_state_is_a_push_after_closing_anew() -> None:
-    grasps, test = many_grasps(), Test(build(PADS, BOX, WHOLE, MujocoOptions()))
+    grasps, test = many_grasps(), Test(build_scene(PADS, BOX, WHOLE, MujocoOptions()))
     ends = []
     for anew in (False, True):
         test._close(grasps, 3)
         test._save()
         test._push(0)
-        test._run(0.4)
+        test._run_rounds(0.4)
         if anew:
             test._close(grasps, 3)
         else:
             test._restore()
         test._push(2)
-        test._run(0.4)
+        test._run_rounds(0.4)
         ends.append(test.data.qpos.copy())
     assert np.array_equal(*ends)
 
@@ -220,7 +220,7 @@ def _called(module, name: str) -> str:
 def test_forward_kinematics_agree_with_ours() -> None:
     hand = two_finger_hand()
     pose, joints = np.array([0.1, 0.2, -0.3, 0.5, -0.5, 0.5, 0.5]), np.array([0.4, -0.2])
-    data = placed_data(build(hand, BOX, WHOLE, MujocoOptions()), joints, pose)
+    data = placed_data(build_scene(hand, BOX, WHOLE, MujocoOptions()), joints, pose)
     ours = body_poses(hand, pose, joints)[0]
     for b in range(hand.bodies):
         assert data.body(f"body{b}").xpos == pytest.approx(ours[b, :3], abs=1e-12)
@@ -229,7 +229,7 @@ def test_forward_kinematics_agree_with_ours() -> None:
 
 def test_coupled_joints_stay_coupled_while_moving() -> None:
     hand = on_one_dof(PADS, 0.5, 0.01)
-    scene = build(hand, BOX, WHOLE, MujocoOptions())
+    scene = build_scene(hand, BOX, WHOLE, MujocoOptions())
     assert scene.model.nu == 1
     data = placed_data(scene, hand.expand(np.array([0.0])))
     scene.command(data, FAR, hand.expand(np.array([0.06])))
@@ -241,7 +241,7 @@ def test_coupled_joints_stay_coupled_while_moving() -> None:
 
 def test_actuators_never_exceed_the_effort() -> None:
     weak = replace(PADS, effort=np.array([2.0, 3.0]))
-    scene = build(weak, BOX, WHOLE, MujocoOptions())
+    scene = build_scene(weak, BOX, WHOLE, MujocoOptions())
     data = placed_data(scene, CONTACT.joint_positions[0], CONTACT.hand_pose[0])
     scene.command(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 0.08)
     mujoco.mj_step(scene.model, data, nstep=5)
@@ -286,12 +286,12 @@ class Exploding(Test):
 @pytest.mark.parametrize("level", ["dexgraspbench", "standard"])
 def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(level: str, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    test = Exploding(build(PADS, BOX, WHOLE, MujocoOptions()))
+    test = Exploding(build_scene(PADS, BOX, WHOLE, MujocoOptions()))
     rollout = getattr(test, level)(grasp_of(), 0)
     assert rollout.outcomes[0] is Outcome.DIVERGED and not rollout.success
     # What the guard is for: after MuJoCo's reset the object stands where it began.
     assert test._motion()[0] < 0.05 and is_invalid(test.data)
-    test._start(grasp_of(), 0)
+    test._mark_running(grasp_of(), 0)
     assert not is_invalid(test.data)
     assert list(tmp_path.iterdir()) == [], "MuJoCo's warnings go to no file"
 
@@ -324,7 +324,7 @@ class Scripted(Test):
     """A push in which displacement and rotation, over their limits, follow functions of time [s]."""
 
     def __init__(self, moved, turned) -> None:
-        self._moved, self._turned, self.elapsed = moved, turned, 0.0
+        self._moved, self._rotation, self.elapsed = moved, turned, 0.0
         self.data = mujoco.MjData(mujoco.MjSpec().compile())
 
     def _run(self, seconds: float) -> None:
@@ -334,7 +334,7 @@ class Scripted(Test):
         return np.array([MAX_DISPLACEMENT_M * self._moved(self.elapsed), 0.0, 0.0])
 
     def _motion(self) -> tuple[float, float]:
-        return float(np.linalg.norm(self._offset())), MAX_ROTATION * self._turned(self.elapsed)
+        return float(np.linalg.norm(self._offset())), MAX_ROTATION * self._rotation(self.elapsed)
 
 
 def still(time: float) -> float:

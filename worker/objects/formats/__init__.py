@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from graspd.service.model.errors import GraspdError, MeshError
-from graspd.worker.objects.format_check import check_format, true_format
+from graspd.worker.objects.format_check import check_format, format_hint
 from graspd.worker.objects.formats import bare, dae, glb, obj
 from graspd.worker.objects.formats.obj import Nearby, no_files
 from graspd.worker.objects.formats.soup import MAX_FACES, Soup, check_soup
@@ -51,7 +51,7 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = no_files) -> Soup:
         with np.errstate(all="ignore"):
             return check_soup(reader(text, nearby) if suffix in _WITH_LOOKS else reader(text))
     except GraspdError as error:
-        raise type(error)(f"{filename}: {true_format(filename, text) or error}") from None
+        raise type(error)(f"{filename}: {format_hint(filename, text) or error}") from None
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:
         # Readers rely on NumPy and json for malformed input: any of their errors is due to the file.
         kind = suffix[1:].upper()

@@ -39,7 +39,7 @@ def read_ply(data: bytes) -> Soup:
     line_end = next(ending for ending in (b"\r\n", b"\n", b"\r") if ending in data[:end])
     start = data.index(line_end, end) + len(line_end)
     order, elements = _header(data[:end].decode("ascii", "replace").splitlines()[1:])
-    body = _Ascii(data[start:]) if order is None else _Binary(data[start:], order)
+    body = _AsciiRows(data[start:]) if order is None else _BinaryRows(data[start:], order)
     vertices = np.zeros((0, 3))
     polygons = (np.zeros(0, np.int64), np.zeros(0, np.int64))
     for element in elements:
@@ -82,7 +82,7 @@ def _header(lines: list[str]) -> tuple[str | None, list[_Element]]:
 _Lists = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
-class _Ascii:
+class _AsciiRows:
     """Reads rows of text."""
 
     def __init__(self, body: bytes) -> None:
@@ -112,7 +112,7 @@ class _Ascii:
         return {}, {n: (np.array(counts[n], dtype=np.int64), np.array(items[n], dtype=np.int64)) for n in counts}
 
 
-class _Binary:
+class _BinaryRows:
     """Reads rows of equal width at once, and other rows one by one."""
 
     def __init__(self, body: bytes, order: str) -> None:
@@ -178,9 +178,9 @@ _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 def read_stl(data: bytes) -> Soup:
     declared, held = int.from_bytes(data[80:84], "little"), (len(data) - _HEADER) / _RECORD.itemsize
     if held == declared:
-        return _binary(data, declared)
+        return _read_binary_stl(data, declared)
     if b"\0" not in data[:1024] and (_FACET.search(data) or b"endsolid" in data[-1024:].lower()):
-        return _ascii(data)
+        return _read_ascii_stl(data)
     if len(data) < _HEADER:
         raise MeshError(f"{len(data)} bytes are too few for an STL file; it is truncated")
     if b"\0" not in data[:1024]:
@@ -188,15 +188,15 @@ def read_stl(data: bytes) -> Soup:
     if declared > held:
         raise MeshError(f"truncated: the header states {declared} faces, but the file has {int(held)}")
     # Some exporters append their own data; all faces stated in the header are present.
-    return _binary(data, declared)
+    return _read_binary_stl(data, declared)
 
 
-def _binary(data: bytes, count: int) -> Soup:
+def _read_binary_stl(data: bytes, count: int) -> Soup:
     check_face_count(count)
     return _soup(np.frombuffer(data, _RECORD, count=count, offset=_HEADER)["corners"].reshape(-1, 3).astype(float))
 
 
-def _ascii(data: bytes) -> Soup:
+def _read_ascii_stl(data: bytes) -> Soup:
     rows = _VERTEX.findall(data)
     check_face_count(len(rows) // 3)
     if len(rows) % 3:

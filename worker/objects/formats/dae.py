@@ -16,7 +16,7 @@ from defusedxml.common import DefusedXmlException
 
 from graspd.service.model.errors import MeshError
 from graspd.worker.objects.formats.obj import Nearby, colour_of, no_files
-from graspd.worker.objects.formats.soup import Soup, soup_of, triangulate, walk
+from graspd.worker.objects.formats.soup import Soup, join_parts, triangulate, walk_scene
 
 Element = ElementTree.Element
 #: Vertices (V, 3), triangles (F, 3) and material symbol of a primitive.
@@ -27,12 +27,12 @@ def read(data: bytes, nearby: Nearby = no_files) -> Soup:
     """Read vertices and triangles; every instance of a mesh in the node tree is its own copy."""
     root = _parse(data)
     library = _Library(root, nearby)
-    soup = soup_of(
+    soup = join_parts(
         (points, triangles, matrix, library.colour(bound.get(symbol, symbol)))
         for geometry, matrix, bound in _instances(root, library)
         for points, triangles, symbol in library.primitives(geometry)
     )
-    return replace(soup, vertices=soup.vertices * _unit(root))
+    return replace(soup, vertices=soup.vertices * _metres_per_unit(root))
 
 
 def _parse(data: bytes) -> Element:
@@ -51,7 +51,7 @@ def _parse(data: bytes) -> Element:
     return root
 
 
-def _unit(root: Element) -> float:
+def _metres_per_unit(root: Element) -> float:
     unit = root.find("asset/unit")
     metres = float(unit.get("meter", "1")) if unit is not None else 1.0
     if not 1e-9 < metres < 1e9:
@@ -68,7 +68,7 @@ class _Library:
         self._primitives: dict[str, list[_Primitive]] = {}
         self._colours: dict[str, np.ndarray] = {}
 
-    def named(self, reference: str | None) -> Element:
+    def find_element(self, reference: str | None) -> Element:
         found = self._known.get((reference or "").removeprefix("#"))
         if found is None:
             raise MeshError(f"it names {(reference or 'nothing')[:40]!r}, which is missing; export it as one file")
@@ -76,7 +76,7 @@ class _Library:
 
     def primitives(self, geometry: str) -> list[_Primitive]:
         if geometry not in self._primitives:
-            mesh = self.named(geometry).find("mesh")
+            mesh = self.find_element(geometry).find("mesh")
             self._primitives[geometry] = [] if mesh is None else list(self._read(mesh))
         return self._primitives[geometry]
 
@@ -91,7 +91,7 @@ class _Library:
                 source = primitive.find("input[@semantic='VERTEX']")
                 if source is None or not 0 < stride <= 64:
                     raise MeshError("a primitive has no vertices; export the mesh again")
-                positions = self.named(source.get("source")).find("input[@semantic='POSITION']")
+                positions = self.find_element(source.get("source")).find("input[@semantic='POSITION']")
                 points = self._points(positions.get("source") if positions is not None else None)
                 counts, order = _polygons(primitive, kind, stride)
                 corners = order[int(source.get("offset", "0")) :: stride]
@@ -100,7 +100,7 @@ class _Library:
                 yield points, triangulate(points, counts, corners), primitive.get("material", "")
 
     def _points(self, reference: str | None) -> np.ndarray:
-        source = self.named(reference)
+        source = self.find_element(reference)
         values, accessor = _numbers(source.find("float_array")), source.find("technique_common/accessor")
         facts = {} if accessor is None else accessor.attrib
         stride, start = int(facts.get("stride", "3")), int(facts.get("offset", "0"))
@@ -125,7 +125,7 @@ class _Library:
             source = next(param.iter("source"), None)
             source = next(param.iter("init_from"), None) if source is None else source
             name = (source.text or "").strip() if source is not None else name
-        found = next(self.named(name).iter("init_from"), None)
+        found = next(self.find_element(name).iter("init_from"), None)
         inner = found.find("ref") if found is not None else None
         file = found if inner is None else inner
         return (file.text or "").strip() if file is not None else ""
@@ -133,8 +133,8 @@ class _Library:
     def _diffuse(self, material: str) -> np.ndarray:
         unknown = np.full(3, np.nan)
         try:
-            instance = self.named(material).find("instance_effect")
-            effect = self.named(instance.get("url") if instance is not None else None)
+            instance = self.find_element(material).find("instance_effect")
+            effect = self.find_element(instance.get("url") if instance is not None else None)
             found = next(effect.iter("diffuse"), None)
             if found is not None and (texture := found.find("texture")) is not None:
                 picture = colour_of(self._picture(effect, texture.get("texture", "")), self._nearby)
@@ -164,12 +164,14 @@ def _numbers(element: Element | None) -> np.ndarray:
 def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarray, dict[str, str]]]:
     """Yield every mesh in the scene: geometry, 4x4 matrix, and material of each symbol."""
     shown = root.find("scene/instance_visual_scene")
-    scene = library.named(shown.get("url")) if shown is not None else root.find("library_visual_scenes/visual_scene")
+    scene = (
+        library.find_element(shown.get("url")) if shown is not None else root.find("library_visual_scenes/visual_scene")
+    )
 
     def below(node: Element) -> list[Element]:
-        return node.findall("node") + [library.named(i.get("url")) for i in node.findall("instance_node")]
+        return node.findall("node") + [library.find_element(i.get("url")) for i in node.findall("instance_node")]
 
-    for node, matrix in walk(scene.findall("node") if scene is not None else [], _matrix, below):
+    for node, matrix in walk_scene(scene.findall("node") if scene is not None else [], _matrix, below):
         if node.find("instance_controller") is not None:
             raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without bones")
         for instance in node.findall("instance_geometry"):

@@ -14,7 +14,7 @@ import numpy as np
 from graspd.service.model.errors import MeshError
 from graspd.service.model.transforms import Floats, quat_to_matrix
 from graspd.worker.objects.formats.obj import UNREADABLE, mean_colour
-from graspd.worker.objects.formats.soup import Part, Soup, soup_of, walk
+from graspd.worker.objects.formats.soup import Part, Soup, join_parts, walk_scene
 
 _INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
 #: Positions are floats or, with KHR_mesh_quantization, integers that nodes or `normalized` scale.
@@ -33,7 +33,7 @@ def read(data: bytes) -> Soup:
     for name in map(str, _list(document, "extensionsRequired")):
         if not name.startswith(_HARMLESS):
             raise _refusal(name)
-    return soup_of(_parts(document, binary))
+    return join_parts(_parts(document, binary))
 
 
 def _parts(document: dict[str, Any], binary: bytes) -> Iterator[Part]:
@@ -81,7 +81,7 @@ def _instances(document: dict[str, Any]) -> Iterator[tuple[int, np.ndarray]]:
     def named(indices: Iterable[Any]) -> Iterator[dict[str, Any]]:
         return (_item(document, "nodes", index) for index in indices)
 
-    for node, matrix in walk(named(roots), _matrix, lambda node: named(node.get("children", []))):
+    for node, matrix in walk_scene(named(roots), _matrix, lambda node: named(node.get("children", []))):
         _refuse_extensions(node)
         _refuse_morphs(node)
         if "skin" in node:

@@ -11,7 +11,7 @@ import numpy as np
 
 from graspd.service.model.errors import MeshError
 from graspd.service.model.transforms import Floats
-from graspd.service.store.mesh_files import MAX_NAMES, reference_of
+from graspd.service.store.mesh_files import MAX_NAMES, parse_reference
 from graspd.worker.objects.formats.soup import Soup, check_face_count, triangulate
 
 _SHADES = 8
@@ -131,7 +131,7 @@ def read_materials(data: bytes, nearby: Nearby) -> dict[bytes, Floats]:
                 found.setdefault(name, colour)
         elif key.lower() == b"map_kd" and name is not None and pictures < MAX_NAMES:
             pictures += 1
-            picture = colour_of(reference_of(rest), nearby)
+            picture = colour_of(parse_reference(rest), nearby)
             if picture is not None:
                 found[name] = picture
     return found
