@@ -84,7 +84,7 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     install_services(app, opened)
     app.state.uploads, app.state.forms, app.state.exports = map(RequestLimiter, (UPLOADS, FORMS, EXPORTS))
     problems.install_handlers(app, problem_page)
-    pages.install(app, opened)
+    pages.install_dashboard(app, opened)
     for router in (*_ROUTERS, *map(asset_router, AssetKind), *datasets.routers, *pages.routers):
         # Adds the routes built at import. `include_router` would rebuild them at the first request. It would also
         # silence warnings for the whole process, which is unsafe while another application is built.

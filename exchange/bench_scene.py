@@ -54,7 +54,7 @@ def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
     mass = sum(volume("hull", (), corners, faces) for corners, faces in pieces)
     facts |= {"scale": 1.0, "density": 1.0, "mass": mass}
     (root / folder / "info" / "simplified.json").write_text(json.dumps(facts, indent=1) + "\n")
-    save_record(root / scene, _scene(name, f"floating/{SCALE}", IDENTITY_POSE))
+    save_record(root / scene, _scene_configuration(name, f"floating/{SCALE}", IDENTITY_POSE))
     split = root / SET / "valid_split" / "all.json"
     names = json.loads(split.read_text()) if split.is_file() else []
     split.write_text(json.dumps(sorted({*names, name}), indent=1) + "\n")
@@ -65,7 +65,7 @@ def write_table(name: str, pose: Floats, number: int, root: Path) -> Path:
     """Write the scene of an exported object at `pose` (7,) on a table; return its file relative to `root`."""
     place = f"{TABLETOP}/{SCALE}_pose{number:03}"
     file = SET / "scene_cfg" / name / f"{place}.npy"
-    scene = _scene(name, place, pose)
+    scene = _scene_configuration(name, place, pose)
     scene["scene"]["table"] = {"type": "plane", "pose": IDENTITY_POSE.copy(), "size": np.array([0.0, 0.0, 1.0])}
     save_record(root / file, scene)
     return file
@@ -77,7 +77,7 @@ def save_record(file: Path, record: Row) -> None:
     np.save(file, np.array(record, dtype=object), allow_pickle=True)
 
 
-def _scene(name: str, place: str, pose: Floats) -> dict[str, Any]:
+def _scene_configuration(name: str, place: str, pose: Floats) -> dict[str, Any]:
     folder = f"../../../processed_data/{name}"
     thing = {
         "type": "rigid_object",

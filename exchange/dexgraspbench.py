@@ -55,7 +55,7 @@ def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
         raise InputError(f"{path} has grasps for {len(mappings)} models of a hand ({names}); give the folder of one")
     sets: dict[tuple[float, bool], list[Row]] = defaultdict(list)
     for file in files:
-        for row in _rows(file):
+        for row in _load_rows(file):
             sets[_object_scale(row), _is_on_table(row)].append(row)
     model, mapping = hand_from_path(hand), mappings.pop()
     return [_imported_grasps(path, model, obj, sets[key], mapping) for key in sorted(sets)]
@@ -130,7 +130,7 @@ def qpos_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: in
     return record
 
 
-def _rows(file: Path) -> list[Row]:
+def _load_rows(file: Path) -> list[Row]:
     """Return the grasps of a file: one, or K if `..._qpos` are (K, 7 + J)."""
     found = load_npy(file)
     if not isinstance(found, dict):

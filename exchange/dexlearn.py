@@ -131,7 +131,7 @@ def _write_group(
             file = top / COLLECTED / TYPES[kind] / lot.name / scene.parent.name / f"{scene.stem}_{lot.id_hash}.npy"
             save_record(file, _record(mapping, lot, rows, scene))
         done.counts["files"] += len(parts)
-        _configure(folder, name, lots[0], [TYPES[kind] for kind in listed])
+        _write_configuration(folder, name, lots[0], [TYPES[kind] for kind in listed])
 
 
 def _rows_of(
@@ -174,7 +174,7 @@ def _record(mapping: HandMapping, lot: ExportPart, rows: NDArray[np.intp], scene
     return record | {"succ_flag": lot.verdict[rows], "row": np.asarray(rows)}
 
 
-def _configure(folder: Path, name: str, lot: ExportPart, types: list[str]) -> None:
+def _write_configuration(folder: Path, name: str, lot: ExportPart, types: list[str]) -> None:
     values: dict[str, Any] = {
         "num_workers": 8,
         "num_points": POINTS,

@@ -24,14 +24,14 @@ from graspd.service.parquet import import_pyarrow
 @contextmanager
 def check_written_files(folder: Path) -> Iterator[None]:
     """Open all files that this context writes to a folder. Raises GraspdError: a library cannot read one."""
-    before = _stamps(folder)
+    before = _file_stamps(folder)
     yield
-    for path, stamp in sorted(_stamps(folder).items()):
+    for path, stamp in sorted(_file_stamps(folder).items()):
         if before.get(path) != stamp and (reader := READERS.get(path.suffix)):
             _open(path, *reader)
 
 
-def _stamps(folder: Path) -> dict[Path, tuple[int, int]]:
+def _file_stamps(folder: Path) -> dict[Path, tuple[int, int]]:
     """Return time of change and size of each file."""
     found = ((path, path.stat()) for path in folder.rglob("*") if path.is_file())
     return {path: (stat.st_mtime_ns, stat.st_size) for path, stat in found}

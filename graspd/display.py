@@ -93,7 +93,7 @@ def sheet_of(grasps: Grasps, count: int, edge: int, limit_s: float = math.inf) -
     from graspd.worker.files.provenance import hand_of_shard, object_of_shard
 
     shard, until = grasps.shard(), time.monotonic() + limit_s
-    rows = _best(grasps, count)
+    rows = _best_rows(grasps, count)
     if not len(rows):
         raise InputError("there is no grasp to draw")
     hand, obj = hand_of_shard(shard, None), object_of_shard(shard, None)
@@ -102,7 +102,7 @@ def sheet_of(grasps: Grasps, count: int, edge: int, limit_s: float = math.inf) -
 
 
 def _table(grasps: Grasps) -> str:
-    rows = _best(grasps, PICTURED)
+    rows = _best_rows(grasps, PICTURED)
     names = [name for name in _FIGURES if name in grasps.metrics]
     head = "".join(f"<th>{escape(name)}</th>" for name in ("row", "valid", *names))
     values = {name: grasps.metric(name) for name in names}
@@ -115,7 +115,7 @@ def _table(grasps: Grasps) -> str:
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def _best(grasps: Grasps, count: int) -> np.ndarray:
+def _best_rows(grasps: Grasps, count: int) -> np.ndarray:
     """Return rows of the best `count` grasps by epsilon, valid ones first."""
     epsilon = np.nan_to_num(np.asarray(grasps.metric("epsilon"), float), nan=-1.0)
     return np.lexsort((-epsilon, ~grasps.is_valid))[:count]

@@ -214,7 +214,7 @@ class Grasps:
         Raises:
             InputError: the file has no such metric.
         """
-        known = self._metric(name)
+        known = self._find_metric(name)
         values = self._columns[known.path]
         if not known.swept:
             return values
@@ -255,7 +255,7 @@ class Grasps:
         if count < 0:
             raise InputError(f"top {metric} of {count}: the number of grasps must be at least 0")
         values = np.asarray(self.metric(metric), float)
-        order = np.argsort(values if self._metric(metric).less_is_better else -values, kind="stable")
+        order = np.argsort(values if self._find_metric(metric).less_is_better else -values, kind="stable")
         return self[order[np.isfinite(values[order])][:count]]
 
     def to_pandas(self) -> Any:
@@ -331,7 +331,7 @@ class Grasps:
             raise InputError(f"{path} cannot be written: {error.strerror}") from None
         return Path(path)
 
-    def _metric(self, name: str) -> GraspMetric:
+    def _find_metric(self, name: str) -> GraspMetric:
         metric = _METRICS.get(name)
         if metric is None or metric.path not in self._columns:
             raise InputError(f"these grasps have no metric {name!r}; they have {', '.join(self.metrics)}")

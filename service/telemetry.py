@@ -61,7 +61,7 @@ class JsonFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         line: dict[str, Any] = {
-            "time": _time(record),
+            "time": _format_time(record),
             "level": record.levelname,
             "process": self._process,
             "pid": os.getpid(),
@@ -80,7 +80,7 @@ class _TextFormatter(logging.Formatter):
         about = " ".join(f"{name}={value}" for name, value in _subjects(record).items())
         trace = f"\n{self.formatException(record.exc_info)}" if record.exc_info else ""
         message = record.getMessage().translate(_OBEYED)
-        text = f"{_time(record)[11:23]} {record.levelname} {record.name} {message}"
+        text = f"{_format_time(record)[11:23]} {record.levelname} {record.name} {message}"
         return without_secrets(f"{text} [{about}]{trace}" if about else f"{text}{trace}")
 
 
@@ -97,7 +97,7 @@ def _subjects(record: logging.LogRecord) -> dict[str, Any]:
     return {name: found[name] for name in SUBJECTS if found.get(name)}
 
 
-def _time(record: logging.LogRecord) -> str:
+def _format_time(record: logging.LogRecord) -> str:
     when = datetime.fromtimestamp(record.created, UTC)
     return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 

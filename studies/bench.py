@@ -220,7 +220,7 @@ def table(result: dict[str, Any]) -> str:
         "| --- | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
     lines += [
-        f"| {r['fidelity']} | {_batches(r)} | {r['processes']} | {r['coarse_points']}, {r['hand_points']} "
+        f"| {r['fidelity']} | {_batch_text(r)} | {r['processes']} | {r['coarse_points']}, {r['hand_points']} "
         f"| {r['faces']} | {r['iterations']} | {r['ms_per_iteration']:.2f} | {r['grasps_per_second']:.1f} "
         f"| {100 * r['spread']:.0f} % | {r['peak_memory_mb']:.0f} |"
         for r in result["runs"]
@@ -239,7 +239,7 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _batches(run: dict[str, Any]) -> str:
+def _batch_text(run: dict[str, Any]) -> str:
     return str(run["batch"]) if run["join"] == 1 else f"{run['join']} × {run['batch']}"
 
 

@@ -21,7 +21,7 @@ from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.messages import TaskMessage, WorkerHeartbeat
-from graspd.service.model.planning import PlannedTask, message_of, plan_tasks
+from graspd.service.model.planning import PlannedTask, create_task_message, plan_tasks
 from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.pipeline.backends import Services
@@ -131,7 +131,7 @@ def record_of(services: Services, job: str) -> JobRecord:
 
 def make_task(services: Services, job: JobRecord, task: PlannedTask, **info: Any) -> ShardManifest:
     """A task of a job done on the spot, in store and index; the index believes `info` in its manifest."""
-    made = make_shard(services.store, message_of(job, task, attempt=1, max_attempt=3))
+    made = make_shard(services.store, create_task_message(job, task, attempt=1, max_attempt=3))
     services.index.write.add_manifests([made.model_copy(update={"info": info}) if info else made])
     return made
 
@@ -149,7 +149,7 @@ def plan_all(services: Services) -> None:
 
 def tasks_of(job: JobRecord) -> list[TaskMessage]:
     tasks = [task for task in plan_tasks(job) if task.stage is Stage.SYNTHESIZE]
-    return [message_of(job, task, attempt=1, max_attempt=3) for task in tasks]
+    return [create_task_message(job, task, attempt=1, max_attempt=3) for task in tasks]
 
 
 def fail_task(services: Services, job: str, task: PlannedTask | TaskView, number: int = 1, **changes: Any) -> str:
@@ -180,7 +180,7 @@ def job_record(wanted: JobRequest, job: str = "c" * 32) -> JobRecord:
 def message_for(stage: Stage = Stage.SYNTHESIZE, *, attempt: int = 1, **changes: Any) -> TaskMessage:
     job = job_record(request(**changes))
     task = next(task for task in plan_tasks(job) if task.stage is stage)
-    return message_of(job, task, attempt=attempt, max_attempt=3)
+    return create_task_message(job, task, attempt=attempt, max_attempt=3)
 
 
 def hold_interpreter(seconds: float) -> None:

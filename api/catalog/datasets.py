@@ -124,9 +124,9 @@ class Datasets:
         ]
         metrics = self._services.index.statistics.compare_distributions(filters, MEAN_METRICS)
         few = max(each.cells for each in both) <= MOST_CELLS
-        return Comparison(*both, list(_settings(*both)), self._pairs(one, other) if few else [], metrics)
+        return Comparison(*both, list(_differing_settings(*both)), self._cell_pairs(one, other) if few else [], metrics)
 
-    def _pairs(self, one: str, other: str) -> list[CellPair]:
+    def _cell_pairs(self, one: str, other: str) -> list[CellPair]:
         cells = [{(cell.hand, cell.object): cell for cell in self.all_cells(name)} for name in (one, other)]
         names = sorted({*cells[0], *cells[1]})
         return [CellPair(*name, cells[0].get(name), cells[1].get(name)) for name in names]
@@ -170,21 +170,21 @@ class Comparison:
     """Distributions of both datasets in the same bins, each over its valid grasps if it requests these, else all."""
 
 
-def _settings(one: DatasetView, other: DatasetView) -> Iterator[tuple[str, str, str]]:
+def _differing_settings(one: DatasetView, other: DatasetView) -> Iterator[tuple[str, str, str]]:
     """Yield options that differ, with both values; then hands and objects that only one dataset has."""
     said = [each.options.model_dump(mode="json") for each in (one, other)]
     for name in said[0]:
         if said[0][name] != said[1][name]:
-            yield name.replace("_", " "), _text(said[0][name]), _text(said[1][name])
+            yield name.replace("_", " "), _setting_text(said[0][name]), _setting_text(said[1][name])
     for name in ("hands", "objects"):
         first, second = (set(getattr(each, name)) for each in (one, other))
         if first != second:
-            yield f"{name} of its own", _text(sorted(first - second)), _text(sorted(second - first))
+            yield f"{name} of its own", _setting_text(sorted(first - second)), _setting_text(sorted(second - first))
 
 
-def _text(value: Any) -> str:
+def _setting_text(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(map(str, value)) or "–"
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_text(one)}" for name, one in value.items()) or "–"
+        return ", ".join(f"{name} {_setting_text(one)}" for name, one in value.items()) or "–"
     return "–" if value in (None, "") else str(value)

@@ -57,7 +57,7 @@ async def end_events(webhooks: Webhooks, since: int, request: Request) -> AsyncI
     """Send `end` for each job or dataset that ended after number `since`."""
     while not await request.is_disconnected() and is_still_authorized(request, Scope.READ):
         try:
-            found = await run_sync(partial(webhooks.ends, since, limit=_ENDS_AT_ONCE))
+            found = await run_sync(partial(webhooks.end_events, since, limit=_ENDS_AT_ONCE))
         except UnavailableError as error:
             yield ServerSentEvent(event="unavailable", data={"detail": str(error)}, retry=RETRY_MS)
             await asyncio.sleep(RETRY_MS / 1000)
@@ -87,8 +87,8 @@ class Webhooks:
     def __init__(self, services: Services) -> None:
         self._services = services
 
-    def ends(self, since: int, *, limit: int) -> list[EndView]:
-        return self._services.index.outbox.ends(since, limit=limit, scope=project_scope())
+    def end_events(self, since: int, *, limit: int) -> list[EndView]:
+        return self._services.index.outbox.end_events(since, limit=limit, scope=project_scope())
 
     def add(self, url: str, states: tuple[End, ...]) -> tuple[WebhookView, str]:
         """Add a webhook; return it with its secret, which cannot be shown again."""

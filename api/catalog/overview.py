@@ -172,7 +172,7 @@ class Probes:
             return self._known[1]
 
     def _probe_all(self) -> Health:
-        questions = {"redis": self._redis, "index": self._index, "store": self._store}
+        questions = {"redis": self._probe_redis, "index": self._probe_index, "store": self._probe_store}
         probes = {name: self._hanging.get(name) or _Probe(name, question) for name, question in questions.items()}
         deadline = time.monotonic() + PATIENCE_S
         parts = {name: probe.part(deadline) for name, probe in probes.items()}
@@ -180,7 +180,7 @@ class Probes:
         controller, workers = self._controller_and_workers() if parts["redis"].ok else (False, 0)
         return Health(ok=all(part.ok for part in parts.values()), parts=parts, controller=controller, workers=workers)
 
-    def _redis(self) -> Part:
+    def _probe_redis(self) -> Part:
         """Probe Redis; a Redis of another service is not ready."""
         part, service = _healthy_part(self._services.queue.ping()), self._services.queue.service_id()
         if service != self._service:
@@ -193,7 +193,7 @@ class Probes:
             self._service = service
         return part
 
-    def _index(self) -> Part:
+    def _probe_index(self) -> Part:
         """Probe the index; an incomplete index is not ready."""
         part, made = _healthy_part(self._services.index.database.ping()), self._services.index.notes.completeness()
         if made is None:
@@ -203,7 +203,7 @@ class Probes:
             return part.model_copy(update={"detail": f"{detail}; run `graspd admin store verify`"})
         return part
 
-    def _store(self) -> Part:
+    def _probe_store(self) -> Part:
         return _healthy_part(self._services.store.probe())
 
     def _controller_and_workers(self) -> tuple[bool, int]:

@@ -26,7 +26,7 @@ from graspd.service.model.records import MOST_TAGS, Grasp, Tag, rows_by_shard, t
 from graspd.service.pipeline import tagging
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.integrity import read_checked
-from graspd.service.store.shards import part_of_shard, read_shard, relative_path_of
+from graspd.service.store.shards import read_shard, relative_path_of, shard_bytes_of_rows
 
 log = logging.getLogger(__name__)
 
@@ -117,7 +117,7 @@ class GraspExports:
         """Write grasps that are in scope, and their selection `said`, to a file; return its size and bytes."""
         file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
         try:
-            {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)
+            {"csv": self._write_csv, "json": self._write_json, "zip": self._write_zip}[format](file, places, said)
             size = file.tell()
             file.seek(0)
         except BaseException:
@@ -125,25 +125,25 @@ class GraspExports:
             raise
         return size, _stream(file)
 
-    def _rows(self, places: Sequence[Grasp]) -> Iterator[dict[str, Any]]:
+    def _export_rows(self, places: Sequence[Grasp]) -> Iterator[dict[str, Any]]:
         tags = self._tags.names_by_grasp(places)
         for grasp in self._grasps.get_many(places):
             yield grasp.model_dump(mode="json") | {"tags": tags.get((grasp.shard_id, grasp.row), [])}
 
-    def _csv(self, file: IO[bytes], places: Sequence[Grasp], _: Mapping[str, Any]) -> None:
+    def _write_csv(self, file: IO[bytes], places: Sequence[Grasp], _: Mapping[str, Any]) -> None:
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
         rows = csv.DictWriter(text, _COLUMNS)
         rows.writeheader()
-        rows.writerows(row | {"tags": " ".join(row["tags"])} for row in self._rows(places))
+        rows.writerows(row | {"tags": " ".join(row["tags"])} for row in self._export_rows(places))
         text.detach()
 
-    def _json(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
+    def _write_json(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
         file.write(b'{"chosen": ' + json.dumps(said).encode() + b', "items": [')
-        for number, row in enumerate(self._rows(places)):
+        for number, row in enumerate(self._export_rows(places)):
             file.write((b",\n" if number else b"\n") + json.dumps(row).encode())
         file.write(b"\n]}\n")
 
-    def _zip(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
+    def _write_zip(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
         shards = rows_by_shard(places)
         if not shards:
             raise InputError("the selection contains no grasp; change it")
@@ -161,7 +161,7 @@ class GraspExports:
                 looked_at += len(mask)
                 names.append(relative_path_of(shard, names))
                 # ZipInfo has a fixed date, so that the same grasps give an identical file.
-                packed.writestr(zipfile.ZipInfo(str(names[-1])), part_of_shard(shard, mask))
+                packed.writestr(zipfile.ZipInfo(str(names[-1])), shard_bytes_of_rows(shard, mask))
             facts = {**said, "looked_at": looked_at, "kept": len(set(places)), "shards": [*map(str, names)]}
             packed.writestr(zipfile.ZipInfo("subset.json"), json.dumps(facts, indent=1) + "\n")
 

@@ -17,7 +17,7 @@ from starlette.datastructures import FormData, UploadFile
 from graspd.api.access.auth import project_scope
 from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.jobs import Jobs
-from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, AssetChoice, choices, choose_asset, refusal_of
+from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, AssetChoice, choose_asset, refusal_of, select_choices
 from graspd.api.dashboard.rendering import render
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, JobsOf
 from graspd.service.index.index import Index
@@ -179,8 +179,8 @@ def _render_form(
         errors=dict.fromkeys([*DEFAULTS, "file", "hand_file"], "") | (errors or {}),
         problem=problem,
         sections={section: inputs_of(section) for section in ("grasps", "scenes")},
-        hands=choices(assets, AssetKind.HAND, str(form["hand"]), things[AssetKind.HAND]),
-        objects=choices(assets, AssetKind.OBJECT, str(form["object"]), things[AssetKind.OBJECT]),
+        hands=select_choices(assets, AssetKind.HAND, str(form["hand"]), things[AssetKind.HAND]),
+        objects=select_choices(assets, AssetKind.OBJECT, str(form["object"]), things[AssetKind.OBJECT]),
         held={kind.value: one.held for kind, one in things.items()},
         fixes={kind.value: one.refused.fixes if one.refused else () for kind, one in things.items()},
         expected=request.app.state.expectations.by_fidelity(form),

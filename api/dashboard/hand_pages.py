@@ -54,8 +54,8 @@ def hands_page(
 @router.get("/{name}", dependencies=READ)
 def hand_page(request: Request, name: str, assets: AssetsOf) -> HTMLResponse:
     hand = assets.get(AssetKind.HAND, name)
-    facts, trouble = _facts(assets, hand)
-    return _page(request, hand, facts, problem=trouble, form=_form_of(facts) if facts else {})
+    facts, trouble = _load_facts(assets, hand)
+    return _render_hand(request, hand, facts, problem=trouble, form=_form_of(facts) if facts else {})
 
 
 @router.post("/{name}", dependencies=SUBMIT, response_model=None)
@@ -73,11 +73,11 @@ def _correct(request: Request, assets: Assets, name: str, fields: FormData) -> H
         said = CorrectionRequest.model_validate(dict(_changed_fields(facts, shown)))
         made = store_correction(assets, hand.digest, said, said.name)
     except (InputError, ConflictError, ValueError) as error:
-        return _page(request, hand, facts, problem=first_message(error), form=shown, status=422)
+        return _render_hand(request, hand, facts, problem=first_message(error), form=shown, status=422)
     return RedirectResponse(f"/hands/{made.digest}", status_code=303)
 
 
-def _page(
+def _render_hand(
     request: Request, hand: AssetView, facts: HandFacts | None, *, problem: str, form: dict[str, Any], status: int = 200
 ) -> HTMLResponse:
     guessed = hand.facts.get("guessed")
@@ -100,7 +100,7 @@ def _page(
     )
 
 
-def _facts(assets: Assets, hand: AssetView) -> tuple[HandFacts | None, str]:
+def _load_facts(assets: Assets, hand: AssetView) -> tuple[HandFacts | None, str]:
     """Return the facts of a hand, or why it cannot be shown; neither while its check runs."""
     try:
         return assets.hand_facts(hand), ""
@@ -128,23 +128,23 @@ def _changed_fields(facts: HandFacts, form: dict[str, Any]) -> Iterator[tuple[st
         yield "name", name
     palm = [f"{what}_{axis}" for what in ("centre", "approach") for axis in "xyz"]
     if any(form[key] != before[key] for key in ("palm_link", *palm)):
-        x, y, z, *approach = (_number(form, key) for key in palm)
+        x, y, z, *approach = (_parse_number(form, key) for key in palm)
         yield "palm", {"link": form["palm_link"], "centre": [x / 1e3, y / 1e3, z / 1e3], "approach": approach}
-    for name, read in (("closing", _direction), ("preshape", _number)):
+    for name, read in (("closing", _parse_direction), ("preshape", _parse_number)):
         keys = {dof: f"{name}.{number}" for number, dof in enumerate(facts.dofs)}
         yield name, {dof: read(form, key) for dof, key in keys.items() if form[key] != before[key]}
     if set(form["fingertips"]) != set(facts.fingertips):
         yield "fingertips", form["fingertips"]
 
 
-def _number(form: dict[str, Any], key: str) -> float:
+def _parse_number(form: dict[str, Any], key: str) -> float:
     try:
         return float(form[key])
     except ValueError:
         raise InputError(f"{key.replace('_', ' ')} {form[key][:40]!r} is no number") from None
 
 
-def _direction(form: dict[str, Any], key: str) -> int:
+def _parse_direction(form: dict[str, Any], key: str) -> int:
     if form[key] not in ("-1", "0", "1"):
         raise InputError(f"{key} {form[key][:40]!r} must be -1, 0 or 1")
     return int(form[key])

@@ -32,7 +32,7 @@ router = APIRouter(include_in_schema=False)
 @router.get("/jobs/{job_id}", dependencies=READ)
 def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags: TagsOf) -> HTMLResponse:
     job = jobs.get(job_id)
-    pictures = _pictures(job)
+    pictures = _list_pictures(job)
     shown = {key: (label, unit) for key, label, unit in COLUMNS}
     validated = job.request.validation != "none"
     query = GraspQuery(job=job_id, valid=True if validated else None)
@@ -45,7 +45,8 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         refresh_s=0 if job.state.is_final else 3,
         job=job,
         histograms=[
-            (*shown[data.metric], data, figures.bars(data, "/grasps", where)) for data in grasps.statistics(job)[0]
+            (*shown[data.metric], data, figures.histogram_bars(data, "/grasps", where))
+            for data in grasps.statistics(job)[0]
         ],
         pictures=pictures[:_SHOWN_PICTURES],
         picture_count=len(pictures),
@@ -81,7 +82,7 @@ def picture(
     return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"})
 
 
-def _pictures(job: JobDetail) -> list[dict[str, Any]]:
+def _list_pictures(job: JobDetail) -> list[dict[str, Any]]:
     """List all rendered pictures; the left one of a stereo pair comes first."""
     eyes = ("left", "right") if job.request.stereo else ("",)
     return [

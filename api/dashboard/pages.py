@@ -243,7 +243,7 @@ routers: Final = (
 )
 
 
-def install(app: FastAPI, services: Services) -> None:
+def install_dashboard(app: FastAPI, services: Services) -> None:
     app.state.templates = environment()
     app.state.pictures = ShardPictures(services.store)
     app.state.expectations = FormEstimates(services.index)

@@ -170,7 +170,7 @@ def draw_chart(measured: PublishedChart, *, axis: str, hand: str = "", object: s
     chosen = [run for run in measured.runs if hand in ("", run.hand) and object in ("", run.object)]
     names = sorted({run.name for run in measured.runs})
     groups = [group for group in _groups(chosen) if any(getattr(run, axis) is not None for run in group)]
-    points = [point for group in groups if (point := _point(group, axis, shown.factor, names)) is not None]
+    points = [point for group in groups if (point := _mean_point(group, axis, shown.factor, names)) is not None]
     points.sort(key=lambda point: point.speed)
     front = pareto_front([(p.speed, p.accuracy if shown.more_is_better else -p.accuracy) for p in points])
     across, x_ticks = _logarithmic_scale([point.speed for point in points])
@@ -178,7 +178,7 @@ def draw_chart(measured: PublishedChart, *, axis: str, hand: str = "", object: s
     shown_at = (replace(p, on_front=n in front, x=across(p.speed), y=up(p.accuracy)) for n, p in enumerate(points))
     placed = _place_labels(list(shown_at))
     line = " ".join(f"{point.x:.1f},{point.y:.1f}" for point in placed if point.on_front)
-    nothing = [group[0].label for group in _groups(chosen) if not _speed(group)]
+    nothing = [group[0].label for group in _groups(chosen) if not _mean_speed(group)]
     return Drawing(placed, line, x_ticks, y_ticks, shown, nothing)
 
 
@@ -189,8 +189,8 @@ def _groups(runs: Sequence[ChartRun]) -> list[list[ChartRun]]:
     return list(groups.values())
 
 
-def _point(runs: list[ChartRun], axis: str, scale: float, names: list[str]) -> Point | None:
-    speed = _speed(runs)
+def _mean_point(runs: list[ChartRun], axis: str, scale: float, names: list[str]) -> Point | None:
+    speed = _mean_speed(runs)
     values = [value for run in runs if (value := getattr(run, axis)) is not None]
     firsts = [run.first_valid_s for run in runs if run.first_valid_s is not None]
     if not speed or not values:
@@ -207,7 +207,7 @@ def _point(runs: list[ChartRun], axis: str, scale: float, names: list[str]) -> P
     )
 
 
-def _speed(runs: Sequence[ChartRun]) -> float:
+def _mean_speed(runs: Sequence[ChartRun]) -> float:
     """Return the number of grasps per second of total time; in charts of graspd 0.1, the geometric mean speed."""
     if all(run.grasp_count is not None for run in runs) and (seconds := sum(run.seconds for run in runs)):
         return sum(run.grasp_count or 0 for run in runs) / seconds

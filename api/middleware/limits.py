@@ -72,7 +72,7 @@ class RateLimit(HttpMiddleware):
         if admission is None:
             await self.app(scope, receive, send)
             return
-        headers = _headers(allowance, admission)
+        headers = _rate_limit_headers(allowance, admission)
         if admission.refused:
             await error_response(request, _refusal(admission, allowance, headers))(scope, receive, send)
             return
@@ -105,7 +105,7 @@ def _allowance_of(key: Key | None, settings: Settings) -> Allowance:
     )
 
 
-def _headers(allowance: Allowance, admission: Admission) -> dict[str, str]:
+def _rate_limit_headers(allowance: Allowance, admission: Admission) -> dict[str, str]:
     if not allowance.per_minute:
         return {}
     return {

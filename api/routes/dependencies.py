@@ -71,7 +71,7 @@ def require_metrics_access(request: Request) -> None:
         authorize(request, Scope.READ)
 
 
-def _provided(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
+def _service_dependency(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
     # A coroutine, because FastAPI would run a plain function in a thread.
     async def found(request: Request) -> Any:
         return getattr(request.app.state, name)
@@ -79,18 +79,18 @@ def _provided(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
     return found
 
 
-JobsOf = Annotated[Jobs, Depends(_provided("jobs"))]
-DatasetsOf = Annotated[Datasets, Depends(_provided("datasets"))]
-AssetsOf = Annotated[Assets, Depends(_provided("assets"))]
-GraspsOf = Annotated[Grasps, Depends(_provided("grasps"))]
-ShardsOf = Annotated[Shards, Depends(_provided("shards"))]
-StoreOf = Annotated[Store, Depends(_provided("store"))]
-UsageOf = Annotated[Usage, Depends(_provided("usage"))]
-TagsOf = Annotated[Tags, Depends(_provided("tags"))]
-ExportsOf = Annotated[GraspExports, Depends(_provided("grasp_exports"))]
-DeletionsOf = Annotated[Deletions, Depends(_provided("deletions"))]
-WebhooksOf = Annotated[Webhooks, Depends(_provided("webhooks"))]
-OverviewOf = Annotated[Overview, Depends(_provided("overview"))]
+JobsOf = Annotated[Jobs, Depends(_service_dependency("jobs"))]
+DatasetsOf = Annotated[Datasets, Depends(_service_dependency("datasets"))]
+AssetsOf = Annotated[Assets, Depends(_service_dependency("assets"))]
+GraspsOf = Annotated[Grasps, Depends(_service_dependency("grasps"))]
+ShardsOf = Annotated[Shards, Depends(_service_dependency("shards"))]
+StoreOf = Annotated[Store, Depends(_service_dependency("store"))]
+UsageOf = Annotated[Usage, Depends(_service_dependency("usage"))]
+TagsOf = Annotated[Tags, Depends(_service_dependency("tags"))]
+ExportsOf = Annotated[GraspExports, Depends(_service_dependency("grasp_exports"))]
+DeletionsOf = Annotated[Deletions, Depends(_service_dependency("deletions"))]
+WebhooksOf = Annotated[Webhooks, Depends(_service_dependency("webhooks"))]
+OverviewOf = Annotated[Overview, Depends(_service_dependency("overview"))]
 Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]
 Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the previous page")]
 

@@ -174,7 +174,7 @@ class CreatedWebhook(WebhookView):
 @event_router.get("/v1/events", dependencies=READ)
 def list_ends(webhooks: WebhooksOf, since: AfterEnd = 0, limit: Limit = 50) -> DeliveryPage:
     """List ended jobs and datasets, oldest first. Ends are stored for 30 days; each appears at least once."""
-    items = webhooks.ends(since, limit=limit)
+    items = webhooks.end_events(since, limit=limit)
     return DeliveryPage(items=items, next=items[-1].seq if items else since)
 
 

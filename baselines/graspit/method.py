@@ -98,7 +98,7 @@ class Search:
                 done = now
                 if now >= chains * (steps - FIRST_STEP):
                     break
-            return self._hands(_sorted(best.numpy(), best_energy.numpy(), begun))
+            return self._hands(_sort_by_energy(best.numpy(), best_energy.numpy(), begun))
 
     def _hands(self, states: Floats) -> HandState:
         n = len(states)
@@ -182,7 +182,7 @@ def self_collision_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
     return (depth > CLASH_M).astype(np.int32).reshape(CLASH_GRID, CLASH_GRID)
 
 
-def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
+def _sort_by_energy(best: Floats, energy: Floats, begun: Floats) -> Floats:
     """Return states (chains * keep, 8), best first; missing ones repeat the chain's last one or its start."""
     out = np.empty_like(best)
     for c, (states, energies) in enumerate(zip(best, energy, strict=True)):

@@ -77,7 +77,7 @@ def _supports(scene: Scene, friction: float | None = None, width_m: float | None
 
 
 def _no_hold(test: Lift, grasps: GraspSet, row: int) -> bool:
-    test._begin(grasps, row)
+    test._set_up_scene(grasps, row)
     if not test._close(grasps, row, give_up=True):
         return False
     test._rise(grasps, row)

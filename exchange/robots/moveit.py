@@ -36,7 +36,9 @@ def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
     names = [found.hand.joint_names[k] for k in bundle.commanded_joints]
 
     def point(posture: str, seconds: float, effort: Floats | None = None) -> dict[str, Any]:
-        return _point(postures[posture].joint_positions[row, bundle.commanded_joints], seconds, effort=effort)
+        return _trajectory_point(
+            postures[posture].joint_positions[row, bundle.commanded_joints], seconds, effort=effort
+        )
 
     # End of each motion: the last time of its phase.
     times = dict(zip(bundle.trajectories[row].phase, bundle.trajectories[row].time, strict=True))
@@ -86,7 +88,7 @@ def _joint_trajectory(bundle: Bundle, names: list[str], points: list[dict[str, A
     return {"header": _header(bundle), "joint_names": names, "points": points}
 
 
-def _point(
+def _trajectory_point(
     positions: Floats, seconds: float, velocities: Floats | None = None, effort: Floats | None = None
 ) -> dict[str, Any]:
     return {
@@ -108,7 +110,7 @@ def _trajectory(bundle: Bundle, path: RobotTrajectory) -> dict[str, Any]:
     kept = [k for k, name in enumerate(path.joint_names) if name not in bundle.description.mimics]
     names = [path.joint_names[k] for k in kept]
     points = [
-        _point(joints[kept], time, rate[kept])
+        _trajectory_point(joints[kept], time, rate[kept])
         for joints, time, rate in zip(path.joints, path.time, path.velocity, strict=True)
     ]
     ways: list[dict[str, Any]] = []

@@ -144,11 +144,11 @@ def write_usd(bundle: Bundle, folder: Path) -> list[Path]:
         bodies, times = body_poses(found.hand, trajectory.hand_pose, joints), RATE * trajectory.time
         at_grasp = posed_bodies(found, "grasp", row)
         for solid, name in zip(moving, prim_names([solid.name for solid in moving]), strict=True):
-            _add(stage, f"{root}/{name}", solid, at_grasp[solid.body], bodies[:, solid.body], times)
+            _add_mesh_prim(stage, f"{root}/{name}", solid, at_grasp[solid.body], bodies[:, solid.body], times)
         pose = found.object_pose[row]
-        _add(stage, f"/World/{object_prim}", thing, pose, _object_poses(found, row, trajectory), times)
+        _add_mesh_prim(stage, f"/World/{object_prim}", thing, pose, _object_poses(found, row, trajectory), times)
         for solid in standing:
-            _add(stage, f"/World/scene/{solid.name}", solid)
+            _add_mesh_prim(stage, f"/World/scene/{solid.name}", solid)
         stage.Save()
     return written
 
@@ -162,7 +162,7 @@ def _object_poses(found: Executions, row: int, trajectory: RobotTrajectory) -> F
     return poses
 
 
-def _add(
+def _add_mesh_prim(
     stage: Any, path: str, solid: Solid, pose: Floats | None = None, poses: Floats | None = None, times: Any = ()
 ) -> None:
     from pxr import Gf, UsdGeom, Vt

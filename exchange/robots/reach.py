@@ -284,8 +284,8 @@ class ArmScene:
         self._exclude_permanent_contacts()
         self.model: Any = self.spec.compile()
         self.data: Any = mujoco.MjData(self.model)
-        self.arm_qpos = _addresses(self.model, arm.model, "arm")
-        self.hand_qpos = _addresses(self.model, hand, "hand")
+        self.arm_qpos = _joint_addresses(self.model, arm.model, "arm")
+        self.hand_qpos = _joint_addresses(self.model, hand, "hand")
 
     def first_collision(self, arm_joints: Floats, hand_joints: Floats, object_pose: Floats) -> str:
         """Return a colliding pair at arm dofs (A,), hand joints (J,) and object pose (7,); empty if there is none."""
@@ -306,8 +306,8 @@ class ArmScene:
         return "an obstacle" if body == "world" else str(body)
 
     def _put(self, model: Any, data: Any, arm_joints: Floats, hand_joints: Floats) -> None:
-        data.qpos[_addresses(model, self.arm.model, "arm")] = self.arm.model.expand(arm_joints)
-        data.qpos[_addresses(model, self.hand, "hand")] = hand_joints
+        data.qpos[_joint_addresses(model, self.arm.model, "arm")] = self.arm.model.expand(arm_joints)
+        data.qpos[_joint_addresses(model, self.hand, "hand")] = hand_joints
 
     def _exclude_permanent_contacts(self) -> None:
         """Exclude body pairs in contact in nearly all random postures, as in MoveIt's setup."""
@@ -351,5 +351,5 @@ def _add_tree(spec: Any, root: Any, model: HandModel, prefix: str, contact: dict
     return bodies
 
 
-def _addresses(model: Any, tree: HandModel, prefix: str) -> NDArray[np.intp]:
+def _joint_addresses(model: Any, tree: HandModel, prefix: str) -> NDArray[np.intp]:
     return np.array([int(model.joint(f"{prefix}{b}").qposadr[0]) for b in tree.joint_body], np.intp)

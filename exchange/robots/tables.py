@@ -28,9 +28,9 @@ def write_tables(bundle: Bundle, folder: Path) -> list[Path]:
     of_object = (f"object_{part}" for part in POSE_PARTS)
     moving = ("grasp", "phase", "time_s", *POSE_PARTS, *of_trajectory)
     return [
-        _table(folder / "grasps.csv", ("grasp", *facts, *of_object), _grasps(bundle)),
-        _table(folder / "postures.csv", ("grasp", "posture", *POSE_PARTS, *joints), _postures(bundle)),
-        _table(folder / "trajectories.csv", moving, _trajectories(bundle)),
+        _write_csv(folder / "grasps.csv", ("grasp", *facts, *of_object), _grasps(bundle)),
+        _write_csv(folder / "postures.csv", ("grasp", "posture", *POSE_PARTS, *joints), _postures(bundle)),
+        _write_csv(folder / "trajectories.csv", moving, _trajectories(bundle)),
     ]
 
 
@@ -65,7 +65,7 @@ def _trajectories(bundle: Bundle) -> Iterable[list[Any]]:
             ]
 
 
-def _table(file: Path, heading: Sequence[str], rows: Iterable[list[Any]]) -> Path:
+def _write_csv(file: Path, heading: Sequence[str], rows: Iterable[list[Any]]) -> Path:
     with file.open("w", newline="", encoding="utf-8") as opened:
         writer = csv.writer(opened)
         writer.writerow(heading)

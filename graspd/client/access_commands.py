@@ -10,7 +10,7 @@ import typer
 
 from graspd.api.access.keys import KeyFile, KeyLimits, ProjectLimits, Scope
 from graspd.api.formatting import minute
-from graspd.client.client import path_of
+from graspd.client.client import request_path
 from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, report_deletion
 from graspd.service.cli import CommandGroup, JsonFlag, load_settings, print_result
 from graspd.service.model.errors import InputError
@@ -218,7 +218,7 @@ def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
 def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """List deliveries of a webhook, newest first."""
     with open_client(url) as client:
-        found = client.send("GET", path_of("webhooks", webhook, "deliveries")).json()
+        found = client.send("GET", request_path("webhooks", webhook, "deliveries")).json()
     rows = []
     for one in found:
         what = f"{one['kind']} {one['subject'][:12] if one['kind'] == 'job' else one['subject']}"
@@ -232,5 +232,5 @@ def delete_webhook(webhook: IdArgument, yes: YesOption = False, url: UrlOption =
     """Delete a webhook and its secret."""
     with open_client(url) as client:
         confirm(f"Delete the webhook {webhook} and its secret for good?", f"the webhook {webhook}", yes=yes)
-        client.delete(path_of("webhooks", webhook))
+        client.delete(request_path("webhooks", webhook))
     report_deletion("webhook", webhook, json=json)

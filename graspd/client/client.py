@@ -64,7 +64,7 @@ class Client(AbstractContextManager["Client"]):
         return self._request_model(JobDetail, "POST", "/v1/jobs", json=request.model_dump(mode="json"))
 
     def job(self, job_id: str) -> JobDetail:
-        return self._request_model(JobDetail, "GET", path_of("jobs", job_id))
+        return self._request_model(JobDetail, "GET", request_path("jobs", job_id))
 
     def jobs(self, *, state: State | None = None, prefix: str = "", limit: int = 50) -> Page[Job]:
         """Return the newest jobs whose ids begin with `prefix`, at most `limit`."""
@@ -73,21 +73,21 @@ class Client(AbstractContextManager["Client"]):
         )
 
     def cancel(self, job_id: str) -> JobDetail:
-        return self._request_model(JobDetail, "POST", path_of("jobs", job_id, "cancel"))
+        return self._request_model(JobDetail, "POST", request_path("jobs", job_id, "cancel"))
 
     def delete(self, path: str, **params: Any) -> None:
         """Delete the resource at an address: `/v1/jobs/ID`, `/v1/objects/NAME`."""
         self.send("DELETE", path, params=params)
 
     def retry(self, job_id: str) -> JobDetail:
-        return self._request_model(JobDetail, "POST", path_of("jobs", job_id, "retry"))
+        return self._request_model(JobDetail, "POST", request_path("jobs", job_id, "retry"))
 
     def assets(self, kind: AssetKind, *, refused: bool = False) -> Iterator[AssetView]:
         """Yield all hands, objects or networks; refused ones only on request."""
         return self._pages(AssetView, f"/v1/{kind.value}s", refused=refused)
 
     def asset(self, kind: AssetKind, name: str) -> AssetView:
-        return self._request_model(AssetView, "GET", path_of(f"{kind.value}s", name))
+        return self._request_model(AssetView, "GET", request_path(f"{kind.value}s", name))
 
     def upload(
         self,
@@ -146,7 +146,7 @@ class Client(AbstractContextManager["Client"]):
         """Yield a job at each change until it ends; reconnect if the connection breaks."""
         while True:
             try:
-                for event, data in self._events(path_of("jobs", job_id, "events")):
+                for event, data in self._events(request_path("jobs", job_id, "events")):
                     if event in ("progress", "end"):
                         yield Job.model_validate(data)
                     if event == "end":
@@ -173,23 +173,23 @@ class Client(AbstractContextManager["Client"]):
         return self._request_model(Page[DatasetView], "GET", "/v1/datasets", params={"limit": limit})
 
     def dataset(self, name: str) -> DatasetView:
-        return self._request_model(DatasetView, "GET", path_of("datasets", name))
+        return self._request_model(DatasetView, "GET", request_path("datasets", name))
 
     def cells(self, name: str, *, state: State | None = None) -> Iterator[CellView]:
         """Yield all cells of a dataset, or those in a state."""
-        return self._pages(CellView, path_of("datasets", name, "cells"), state=state)
+        return self._pages(CellView, request_path("datasets", name, "cells"), state=state)
 
     def cancel_dataset(self, name: str) -> DatasetView:
-        return self._request_model(DatasetView, "POST", path_of("datasets", name, "cancel"))
+        return self._request_model(DatasetView, "POST", request_path("datasets", name, "cancel"))
 
     def retry_dataset(self, name: str) -> DatasetView:
-        return self._request_model(DatasetView, "POST", path_of("datasets", name, "retry"))
+        return self._request_model(DatasetView, "POST", request_path("datasets", name, "retry"))
 
     def take_snapshot(self, name: str) -> SnapshotView:
-        return self._request_model(SnapshotView, "POST", path_of("datasets", name, "snapshots"))
+        return self._request_model(SnapshotView, "POST", request_path("datasets", name, "snapshots"))
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
-        return self._request_model(Snapshot, "GET", path_of("datasets", name, "snapshots", digest))
+        return self._request_model(Snapshot, "GET", request_path("datasets", name, "snapshots", digest))
 
     def watch_dataset(self, name: str) -> Iterator[DatasetView]:
         """Yield a dataset every second until it ends."""
@@ -230,7 +230,7 @@ class Client(AbstractContextManager["Client"]):
     def _events(self, path: str) -> Iterator[tuple[str, Any]]:
         with _convert_errors(self.url), self._http.stream("GET", path, timeout=_STREAM_TIMEOUT) as answer:
             _raise_for(answer)
-            yield from events_of(answer)
+            yield from parse_events(answer)
 
     def send(self, method: str, path: str, *, params: dict[str, Any] | None = None, **options: Any) -> httpx.Response:
         """Send a request and return the response; raise a problem document as an exception."""
@@ -246,7 +246,7 @@ class Client(AbstractContextManager["Client"]):
         return answer
 
 
-def path_of(*parts: str) -> str:
+def request_path(*parts: str) -> str:
     """Build an address of the API from its parts, with escaped names: `/v1/tags/good%20ones/remove`."""
     return "/v1/" + "/".join(quote(part, safe="") for part in parts)
 
@@ -275,7 +275,7 @@ def _authorization(key: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {key}"}
 
 
-def events_of(answer: httpx.Response) -> Iterator[tuple[str, Any]]:
+def parse_events(answer: httpx.Response) -> Iterator[tuple[str, Any]]:
     for event in EventSource(answer).iter_sse():
         if event.data:
             yield event.event, event.json()

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from graspd.api.formatting import count, minute, percent, size
 from graspd.client.add_commands import name_of_set, upload_set
-from graspd.client.client import Client, path_of
+from graspd.client.client import Client, request_path
 from graspd.client.reports import (
     UrlOption,
     YesOption,
@@ -38,7 +38,7 @@ from graspd.service.model.base import Name, error_text
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError, did_you_mean
 from graspd.service.model.options import validate
-from graspd.service.model.scene_spec import check_object_name, scene_option
+from graspd.service.model.scene_spec import check_object_name, parse_scene_option
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.export import export_shards
 from graspd.service.pipeline.datasets.spec import DatasetRequest, Estimate, Matrix
@@ -87,7 +87,7 @@ def dataset_plan(
     if "options" in given:
         given["options"] = parse_pairs(given["options"])
     if "scene" in given:
-        given["scene"] = scene_option(given["scene"])
+        given["scene"] = parse_scene_option(given["scene"])
     if "neighbours" in given:
         given["neighbours"] = [check_object_name(one) for one in given["neighbours"]]
     said = read_spec(spec) if spec is not None else {}
@@ -116,7 +116,7 @@ def read_spec(file: Path) -> dict[str, Any]:
         raise InputError(f"{file} must contain the keys of a dataset: hands, objects, grasps, ...")
     try:
         if isinstance(found.get("scene"), str):
-            found["scene"] = scene_option(found["scene"], beside=file.parent)
+            found["scene"] = parse_scene_option(found["scene"], beside=file.parent)
         if isinstance(beside := found.get("neighbours"), list):
             found["neighbours"] = [check_object_name(one) if isinstance(one, str) else one for one in beside]
         spec = validate(Spec, found)
@@ -271,7 +271,7 @@ def delete(
         goes = f"{count(found.cells)} cell{'s' * (found.cells != 1)}, {count(found.grasps)} grasps"
         goes += f" ({size(found.size_bytes)})" + ", its snapshots" * with_snapshots
         confirm(f"Delete dataset {name} with {goes}?", f"dataset {name}", yes=yes)
-        client.delete(path_of("datasets", name), with_snapshots=with_snapshots)
+        client.delete(request_path("datasets", name), with_snapshots=with_snapshots)
     report_deletion("dataset", name, json=json, undo=f"graspd datasets restore {name}")
 
 
@@ -322,7 +322,7 @@ def export(
             fetched = export_shards(
                 taken,
                 out,
-                lambda shard: client.fetch(path_of("shards", shard.id, "file")),
+                lambda shard: client.fetch(request_path("shards", shard.id, "file")),
                 lambda done, files, fetched: progress.update(bar, completed=fetched, files=f"{done}/{files}"),
             )
     told = {"dataset": name, "snapshot": taken.digest, "out": str(out), "files": len(taken.shards), "fetched": fetched}

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from graspd.api.formatting import count, duration, metric, percent, size, valid_yield, worker_time
 from graspd.api.models import Job, JobDetail, StageStatus
-from graspd.client.client import Client, path_of
+from graspd.client.client import Client, request_path
 from graspd.service.cli import load_settings, plain_console, plain_table, print_json, print_result
 from graspd.service.index.views import CellView, DatasetView, Validated
 from graspd.service.model.domain import JobOptions
@@ -58,7 +58,7 @@ def report_deletion(what: str, name: str, *, json: bool, undo: str = "") -> None
 
 def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
     with open_client(url) as client:
-        found = client.send("POST", path_of(f"{what}s", name, "restore")).json()
+        found = client.send("POST", request_path(f"{what}s", name, "restore")).json()
     print_result({"restored": found["id"], "kind": what}, f"{what} {name} is restored", json=json)
 
 
@@ -304,7 +304,7 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
     left = f", {duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
     console.print(f"{dataset.name}  {dataset.state.value}  {percent(dataset.progress)}{left}")
     console.print(f"cells: {states}")
-    candidates = f" of {count(dataset.candidates)} candidates ({_yield(dataset)})" if dataset.candidates else ""
+    candidates = f" of {count(dataset.candidates)} candidates ({_yield_text(dataset)})" if dataset.candidates else ""
     console.print(
         f"grasps: {count(dataset.counted)} {dataset.options.displayed_status}{candidates}, "
         f"{count(dataset.asked)} requested; "
@@ -357,7 +357,7 @@ def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
     return dataset
 
 
-def _yield(made: Validated) -> str:
+def _yield_text(made: Validated) -> str:
     return f"at {valid_yield(made)}" if made.validated else "not validated"
 
 
@@ -367,7 +367,7 @@ def _cell_text(cell: CellView, options: JobOptions) -> str:
         words.append(percent(cell.progress))
     if cell.candidates:
         made = cell.counted(options)
-        words.append(f"{count(made)}/{count(cell.asked)} {_yield(cell)}")
+        words.append(f"{count(made)}/{count(cell.asked)} {_yield_text(cell)}")
     if cell.tasks_failed:
         words.append(f"{cell.tasks_failed} failed")
     return " ".join(words)

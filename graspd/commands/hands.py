@@ -40,10 +40,10 @@ def check(
 ) -> None:
     """Check whether a hand can be used, report guesses, and run the self-test. Needs no server."""
     options = hand_options(**options)
-    with _bar("reading     ", quiet=json) as run:
+    with _progress_bar("reading     ", quiet=json) as run:
         report = report_hand(file, options, run)
     if picture and report["verdict"] != "refuse":
-        _draw(hand_from_path(file, options), picture, collision=collision)
+        _write_picture(hand_from_path(file, options), picture, collision=collision)
     if write and report["verdict"] != "refuse":
         _write(file, options, report, write)
     if not json:
@@ -62,12 +62,12 @@ def check(
 def _self_test(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]:
     from graspd.worker.stages.hand_self_test import self_test_facts
 
-    with _bar("self-test   ", "starting; the first run on a machine compiles its kernels", quiet=quiet) as run:
+    with _progress_bar("self-test   ", "starting; the first run on a machine compiles its kernels", quiet=quiet) as run:
         return self_test_facts(lambda: hand_from_path(file, options), run)
 
 
 @contextmanager
-def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[ExecutionContext]:
+def _progress_bar(what: str, first: str = "", *, quiet: bool) -> Iterator[ExecutionContext]:
     """Yield a context whose progress is shown on a terminal."""
     columns = (TextColumn(f"  {what}       {{task.description}}", markup=False), BarColumn(), TimeElapsedColumn())
     console = plain_console(stderr=True)
@@ -79,7 +79,7 @@ def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[ExecutionContex
         )
 
 
-def _draw(hand: HandModel, picture: Path, *, collision: bool) -> None:
+def _write_picture(hand: HandModel, picture: Path, *, collision: bool) -> None:
     from graspd.worker.rendering.hands import without_visuals
     from graspd.worker.rendering.portraits import hand_portrait, write_png
 

@@ -73,7 +73,7 @@ def render(
 ) -> None:
     """Render pictures of scenes: colour, depth, segmentation, boxes, and the `--channels` requested."""
     started = perf_counter()
-    scene = _scenes(scenes)
+    scene = _load_scenes(scenes)
     obj = object_of_shard(scene, object)
     number = int(scene.attributes.get("seed", 0)) if seed is None else seed  # type: ignore[arg-type]
     used = Device(device).resolve()
@@ -176,7 +176,7 @@ def _named_rows(base: Shard, rows: list[int], chosen: NDArray[np.bool_], word: s
     return np.array(rows, np.intp)
 
 
-def _scenes(path: Path) -> Shard:
+def _load_scenes(path: Path) -> Shard:
     shard = read_shard(path)
     if shard.kind == "base" and "scene/object_pose" not in shard.arrays:
         raise InputError(f"{path} has free grasps: a scene shard is needed here; make one: graspd scene")

@@ -111,10 +111,10 @@ def stability(
     if unknown := [name for name in only or [] if name not in STUDIES]:
         raise InputError(f"there is no study {unknown[0]!r}; choose one of {choices_text(unknown[0], STUDIES)}")
     if source:
-        found = _merge([_read(path, "stability", parse_stability) for path in source])
+        found = _merge([_read_record(path, "stability", parse_stability) for path in source])
         found = replace(found, maps=[one for one in found.maps if not only or one.name in only])
     else:
-        found = _measure(tuple(only or STUDIES), hand, object_, quick=quick, long=long, threads=threads)
+        found = _measure_maps(tuple(only or STUDIES), hand, object_, quick=quick, long=long, threads=threads)
     if out is not None:
         write(found, out)
     key = _publish(STABILITY, found.as_json(), data_dir) if publish else None
@@ -124,7 +124,7 @@ def stability(
     print_result(told, markdown(found), json=json)
 
 
-def _measure(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: bool, threads: int) -> Stability:
+def _measure_maps(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: bool, threads: int) -> Stability:
     from graspd.worker.engines import backend
 
     backend.start_warp()
@@ -137,7 +137,7 @@ def _measure(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: 
     return Stability(timestamp(), command, {"graspd": PACKAGE_VERSION, "warp": wp.__version__}, maps)
 
 
-def _read(path: Path, kind: str, parse: Callable[[Any], Any]) -> Any:
+def _read_record(path: Path, kind: str, parse: Callable[[Any], Any]) -> Any:
     """Parse a JSON file of `graspd KIND --out`; raise InputError for any other file."""
     try:
         return parse(loads(path.read_text()))
@@ -201,7 +201,7 @@ def chart(
     from graspd.worker.hands.load import hand_from_path
 
     if source is not None:
-        _finish(_read_chart(source), out, data_dir, publish=publish, json=json)
+        _write_chart(_read_chart(source), out, data_dir, publish=publish, json=json)
         return
     knob_values(knobs=knob or ())  # Report a wrong name before an hour of work.
     if scene != "free" and sweep:
@@ -235,10 +235,10 @@ def chart(
         result["sweeps"] = turn(
             models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=on, knobs=knob or (), say=_echo
         )
-    _finish(result, out, data_dir, publish=publish, json=json)
+    _write_chart(result, out, data_dir, publish=publish, json=json)
 
 
-def _finish(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, publish: bool, json: bool) -> None:
+def _write_chart(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, publish: bool, json: bool) -> None:
     from graspd.studies.chart.report import markdown, write
 
     if out is not None:
@@ -255,7 +255,7 @@ def _read_chart(path: Path) -> dict[str, Any]:
             raise ValueError("no chart")
         return found
 
-    found: dict[str, Any] = _read(path, "chart", parse)
+    found: dict[str, Any] = _read_record(path, "chart", parse)
     if missing := [key for key in ("summary", "by_hand", "models") if key not in found]:
         raise InputError(f"{path} has no {missing[0]}, because an earlier graspd wrote it; measure again")
     return found

@@ -59,7 +59,7 @@ def synth(
     if "payload" not in options and asked.scene_spec.kind != "free" and asked.validation != "none":
         asked = asked.model_copy(update={"payload": asked.mass is not None or asked.density is not None})
     settings = engine_settings()
-    with catch_stop_signals() as stop, _bar(quiet=json) as progress:
+    with catch_stop_signals() as stop, _progress_bar(quiet=json) as progress:
         try:
             made = synthesize_with_options(
                 hand,
@@ -84,7 +84,7 @@ def synth(
 
 
 @contextmanager
-def _bar(*, quiet: bool) -> Iterator[Report]:
+def _progress_bar(*, quiet: bool) -> Iterator[Report]:
     """Show a progress bar on a terminal; yield the callback that updates it."""
     if quiet or not sys.stderr.isatty():
         yield lambda done, total, message: None

@@ -79,7 +79,7 @@ class Database:
         self._url = url
         self._anew = anew
         self.was = ""
-        self._file = _file_of(url)
+        self._file = _sqlite_file(url)
         self._write_lock = threading.Lock()
         self._opening = threading.Lock()
         self._identity: Identity = None
@@ -209,7 +209,7 @@ def rows_in(
         yield from connection.execute(query.where(column.in_(some)))
 
 
-def _file_of(url: str | URL) -> SqliteFile | None:
+def _sqlite_file(url: str | URL) -> SqliteFile | None:
     """Return the file of an SQLite index, None if it has no file; InputError for an invalid URL."""
     with convert_url_errors():
         parsed = make_url(url)

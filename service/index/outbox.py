@@ -28,7 +28,7 @@ class DueDelivery:
     attempts: int
 
 
-def append_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
+def append_end_events(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
     """Append ends of jobs and datasets within a transaction, numbered in ascending order.
 
     A number is the time [ms], or the last number plus 1 if greater: a new index continues the numbers of a lost one.
@@ -44,7 +44,7 @@ def last_end_number(connection: Connection) -> int:
 
 
 class Outbox(IndexPart):
-    def ends(self, since: int, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[EndView]:
+    def end_events(self, since: int, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[EndView]:
         query = select(ends).where(ends.c.seq > since, *scope_conditions(scope, ends)).order_by(ends.c.seq).limit(limit)
         return [EndView(**row) for row in self.database.rows(query)]
 
@@ -59,7 +59,7 @@ class Outbox(IndexPart):
         with self.database.write_transaction() as connection:
             untold = (datasets.c.name == name, datasets.c.told < events)
             if connection.execute(update(datasets).where(*untold).values(told=events)).rowcount:
-                append_ends(connection, [row])
+                append_end_events(connection, [row])
 
     def add(self, hook: Webhook, *, seen: int | None = None, within: Connection | None = None) -> None:
         """Add a webhook; it receives ends after number `seen`, by default all future ends."""

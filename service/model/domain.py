@@ -27,8 +27,8 @@ from graspd.service.model.scene_spec import (
     SceneOption,
     SceneSpec,
     Touch,
+    build_scene_spec,
     has_table,
-    scene_of,
 )
 from graspd.service.model.states import AssetKind
 
@@ -317,7 +317,7 @@ class JobOptions(Model):
 
     @property
     def scene_spec(self) -> SceneSpec:
-        return scene_of(self.scene, faces=self.faces, touch=self.touch, beside=self._named_neighbours)
+        return build_scene_spec(self.scene, faces=self.faces, touch=self.touch, beside=self._named_neighbours)
 
     @property
     def _named_neighbours(self) -> tuple[NamedNeighbour, ...]:

@@ -86,7 +86,7 @@ def plan_tasks(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedT
             inputs = (output,)
 
 
-def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
+def create_task_message(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
     return TaskMessage(
         schema_=max(needed_schema(job.request), SCHEMA_OF_RANGES if count_batches(task.count) > 1 else 0),
         newest_schema=TASK_SCHEMA,

@@ -237,17 +237,19 @@ class ObjectSet(Record):
     project: Project = ""
 
 
-def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:
+def create_job_request(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:
     """Return the request of a cell; `fidelity` replaces `auto` and its target."""
     shared = {name: getattr(options, name) for name in JobOptions.model_fields}
     return JobRequest(hand=hand, object=obj, **shared | ({"fidelity": fidelity, "target": ""} if fidelity else {}))
 
 
-def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: str = "", project: str = "") -> JobRecord:
+def create_job_record(
+    cell: Cell, options: JobOptions, revisions: dict[str, int], owner: str = "", project: str = ""
+) -> JobRecord:
     """Return the job of a cell as planned at the creation of the dataset. Jobs of datasets run in bulk."""
     return JobRecord(
         id=cell.job_id,
-        request=request_of(options, cell.hand.name, cell.object.name, cell.fidelity),
+        request=create_job_request(options, cell.hand.name, cell.object.name, cell.fidelity),
         revisions=revisions,
         hand_digest=cell.hand.digest,
         object_digest=cell.object.digest,
@@ -259,7 +261,7 @@ def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: st
     )
 
 
-def object_set_of(
+def create_object_set(
     name: str, objects: Iterable[str], *, after: str = "", owner: str = "", project: str = ""
 ) -> ObjectSet:
     """Return a version of a set; its digest includes `after`, the digest of the previous version."""

@@ -268,7 +268,7 @@ SceneOption = Annotated[
 ]
 
 
-def scene_of(
+def build_scene_spec(
     option: str | SceneDocument,
     *,
     faces: Literal["drawn", "all"] = "drawn",
@@ -294,7 +294,7 @@ def check_object_name(text: str) -> str:
     return text
 
 
-def scene_option(
+def parse_scene_option(
     text: str, *, beside: Path | None = None, named: Callable[[str], str] = check_object_name
 ) -> str | dict[str, Any]:
     """Return the scene of a request: a kind, or the content of a scene file relative to folder `beside`.

@@ -23,7 +23,7 @@ from graspd.service.model.clock import age_of, timestamp
 from graspd.service.model.digests import digest_files
 from graspd.service.model.domain import Asset
 from graspd.service.model.errors import DamagedError, GraspdError, InputError, NotFoundError
-from graspd.service.model.planning import PlannedTask, message_of, plan_tasks
+from graspd.service.model.planning import PlannedTask, create_task_message, plan_tasks
 from graspd.service.model.records import (
     AttemptRecord,
     DatasetEvent,
@@ -352,7 +352,7 @@ def _repair_object(services: Services, one: Damage, harmed: set[str]) -> str:
     if one.what != MISSING:
         _set_aside_result(services, one, stage)
     number = len(task_attempts(services.store, task.id)) + 1
-    message = message_of(job, task, attempt=number, max_attempt=number)
+    message = create_task_message(job, task, attempt=number, max_attempt=number)
     services.queue.enqueue([message], Priority.BULK, again=True)
     return ""
 

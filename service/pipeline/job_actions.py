@@ -31,7 +31,7 @@ from graspd.service.model.messages import (
     capabilities,
     requirements_of,
 )
-from graspd.service.model.planning import message_of, priority_of
+from graspd.service.model.planning import create_task_message, priority_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import MOST_BATCHES, DatasetMember, JobRecord
 from graspd.service.model.scene_spec import HalfSpace, Pose, Supports
@@ -280,7 +280,7 @@ def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Route
     held: dict[str, list[str]] = defaultdict(list)
     for task in ready:
         most = task.retried_upto + services.settings.task_attempts
-        message = message_of(task.job, task.task, attempt=task.last_attempt + 1, max_attempt=most)
+        message = create_task_message(task.job, task.task, attempt=task.last_attempt + 1, max_attempt=most)
         place = routes.route_of(requirements_of(message))
         if place.held:
             held[place.held].append(task.task.id)

@@ -278,7 +278,7 @@ class WebhookDispatcher:
                 self._ended.set()
 
     def _deliver(self, due: DueDelivery) -> None:
-        body = body_of(due.end)
+        body = webhook_body(due.end)
         at = int(time.time())
         headers = {
             "Content-Type": "application/json",
@@ -293,5 +293,5 @@ class WebhookDispatcher:
         outbox.record_attempt(due, status=answer.status, detail=answer.detail, done=done, final=answer.is_final)
 
 
-def body_of(end: EndView) -> bytes:
+def webhook_body(end: EndView) -> bytes:
     return json.dumps(end.model_dump(mode="json"), sort_keys=True, separators=(",", ":")).encode()

@@ -202,7 +202,7 @@ def list_key(name: str) -> str:
     return f"{Queue.redis_queue_namespace_prefix}{name}"
 
 
-def held_key(name: str) -> str:
+def lease_registry_key(name: str) -> str:
     return str(StartedJobRegistry.key_template.format(name))
 
 
@@ -225,5 +225,5 @@ def execution_keys(entry: str) -> tuple[str, str]:
 
 
 def key_types(lists: list[str]) -> dict[str, str]:
-    types = ((list_key, "list"), (held_key, "zset"), (workers_key, "set"))
+    types = ((list_key, "list"), (lease_registry_key, "zset"), (workers_key, "set"))
     return {key(name): kind for name in lists for key, kind in types}

@@ -131,7 +131,7 @@ class RqQueue:
                     pipe.delete(entries.job_key(entries.decode_text(job)))
                 pipe.delete(key)
                 # Leases of running tasks are read under the list's name.
-                if not self.connection.exists(entries.held_key(name)):
+                if not self.connection.exists(entries.lease_registry_key(name)):
                     pipe.srem(entries.LISTS, key)
             pipe.execute()
 
@@ -139,7 +139,7 @@ class RqQueue:
         """Return the leases of all workers, living or dead; reading changes nothing."""
         # RQ's own readers also move lost tasks and run callbacks, so the keys are read directly.
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
-            keys = [entries.held_key(name) for name in entries.list_names(self.connection)]
+            keys = [entries.lease_registry_key(name) for name in entries.list_names(self.connection)]
             for key in keys:
                 pipe.zrange(key, 0, -1, withscores=True)
             found = pipe.execute()
@@ -257,7 +257,7 @@ class RqQueue:
             for name in lists:
                 pipe.llen(entries.list_key(name))
                 pipe.lindex(entries.list_key(name), 0)
-                pipe.zcard(entries.held_key(name))
+                pipe.zcard(entries.lease_registry_key(name))
             found = pipe.execute()
             for head in found[1::3]:
                 pipe.hget(entries.job_key(entries.decode_text(head)), "enqueued_at")

@@ -15,7 +15,7 @@ from graspd.service.model import transforms
 from graspd.service.model.errors import InputError
 from graspd.service.model.pinhole import back_project, fitted_normals, surface_normals
 from graspd.service.model.transforms import Floats
-from graspd.service.readers.depth_noise import DepthNoise, incidence_angle, noise_of
+from graspd.service.readers.depth_noise import DepthNoise, incidence_angle, parse_depth_noise
 from graspd.service.readers.pictures import PictureAddress, Pictures, Scenes
 from graspd.service.store.shards import Shard
 
@@ -87,7 +87,7 @@ class Clouds(Sequence[dict[str, Any]]):
         if points < 1 or voxel_m < 0 or touch_m <= 0 or seed < 0:
             raise InputError("clouds need points >= 1, voxel_m >= 0, touch_m > 0 and seed >= 0")
         self.pictures, self.points, self.frame, self.epoch = pictures, points, chosen, 0
-        self._noise, self._whole, self._voxel, self._seed = noise_of(noise), scene, voxel_m, seed
+        self._noise, self._whole, self._voxel, self._seed = parse_depth_noise(noise), scene, voxel_m, seed
         self._postures, self._surface, self._touch = tuple(postures), hand_surface, touch_m
         self._fused = fuse
         self._places = _group_by_scene(pictures.places) if fuse else [[place] for place in pictures.places]

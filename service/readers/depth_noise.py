@@ -213,7 +213,7 @@ NOISES: Final[Mapping[str, DepthNoise]] = MappingProxyType(
 )
 
 
-def noise_of(given: str | DepthNoise | None) -> DepthNoise | None:
+def parse_depth_noise(given: str | DepthNoise | None) -> DepthNoise | None:
     if given is None or isinstance(given, DepthNoise):
         return given
     if given not in NOISES:

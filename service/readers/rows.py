@@ -53,7 +53,7 @@ class RowTable:
     @classmethod
     def from_file(cls, file: h5py.File, columns: Iterable[str], name: str) -> RowTable:
         """Read the table of an open shard, and the verified values of columns that are not packed."""
-        found = {column: _packed(file[column]) for column in columns}
+        found = {column: _packed_column(file[column]) for column in columns}
         packed = {column: places for column, places in found.items() if places is not None}
         held = {column: read_column(file, column, name) for column in found.keys() - packed}
         return cls(name, packed, held)
@@ -80,7 +80,7 @@ class RowTable:
         return found
 
 
-def _packed(dataset: h5py.Dataset) -> _PackedColumn | None:
+def _packed_column(dataset: h5py.Dataset) -> _PackedColumn | None:
     """Return a column in the layout in which `write_shard` packs pictures; None for another layout."""
     if dataset.chunks is None or dataset.chunks != (1, *dataset.shape[1:]):
         return None

@@ -45,7 +45,7 @@ def _evaluate(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any])
     if isinstance(node, Negation):
         return ~_evaluate(node.part, columns, said)
     if isinstance(node, Flag):
-        return _flag(node.name, columns)
+        return _status_mask(node.name, columns)
     compare = _OPERATORS[node.op]
     if isinstance(node, MetricComparison):
         values = metric_values(_METRICS[node.name], columns)
@@ -57,7 +57,7 @@ def _evaluate(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any])
     return np.full(count, bool(compare(str(said.get(node.name, "")), node.word)))
 
 
-def _flag(name: str, columns: Mapping[str, Array]) -> Mask:
+def _status_mask(name: str, columns: Mapping[str, Array]) -> Mask:
     if name in _STATUSES:
         return _STATUSES[name](columns)
     path = _FLAGS[name]

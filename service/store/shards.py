@@ -211,15 +211,15 @@ def json_attribute(value: object) -> str:
     return json.dumps(value, sort_keys=True)
 
 
-def carried_attributes(shard: Shard) -> dict[str, Attribute]:
+def inherited_attributes(shard: Shard) -> dict[str, Attribute]:
     return {name: value for name, value in shard.attributes.items() if name != "schema"}
 
 
-def part_of_shard(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
+def shard_bytes_of_rows(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
     """Return the bytes of a base shard with the rows in a mask (N,); values and scenes are unchanged."""
     axes = {path: column.shape.split()[0] for path, column in SCHEMAS["base"].items()}
     arrays = {path: array[mask] if axes[path] == "N" else array for path, array in shard.arrays.items()}
-    attributes = carried_attributes(shard)
+    attributes = inherited_attributes(shard)
     if "shard_id" in attributes:
         attributes["shard_id"] = digest_json([attributes["shard_id"], np.flatnonzero(mask).tolist()])
     return write_shard("base", arrays, attributes)

@@ -19,7 +19,7 @@ from graspd.service.model import names
 from graspd.service.model.errors import InputError, NotFoundError
 from graspd.service.model.metrics import GRASP_METRICS
 from graspd.service.model.planning import plan_tasks
-from graspd.service.model.records import DatasetRecord, Snapshot, job_of
+from graspd.service.model.records import DatasetRecord, Snapshot, create_job_record
 from graspd.service.model.states import AssetKind
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.readers import ShardFile, Shards, open_shards
@@ -74,7 +74,7 @@ def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, c
         {obj.name: _stored_asset(store, AssetKind.OBJECT, obj.name, obj.digest) for obj in record.objects},
         taken,
         record,
-        _gaps(store, record, taken),
+        _missing_cells(store, record, taken),
     )
 
 
@@ -174,11 +174,11 @@ def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
     return found
 
 
-def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, tuple[int, str]]:
+def _missing_cells(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, tuple[int, str]]:
     there = {shard.id for shard in taken.shards}
     gaps = {}
     for cell in record.cells():
-        tasks = plan_tasks(job_of(cell, record.options, record.revisions))
+        tasks = plan_tasks(create_job_record(cell, record.options, record.revisions))
         if missing := [task for task in tasks if task.output not in there]:
             reasons = (attempts[-1].reason for task in missing if (attempts := task_attempts(store, task.id)))
             gaps[cell.hand.name, cell.object.name] = len(missing), next(reasons, "not made yet, or cancelled")
@@ -235,7 +235,7 @@ def _read_shard_file(contents: Contents, file: ShardFile, size: int | None) -> S
         return unopened
     path = contents.shards.path(file)
     with open_shard(path) as opened:
-        said = {key: _plain(value) for key, value in opened.attrs.items()}
+        said = {key: _json_value(value) for key, value in opened.attrs.items()}
         columns = {name: read_column(opened, name, str(path)) for name in COLUMNS[file.kind] if name in opened}
         rows = len(opened[{"base": "quality/valid", "scene": "grasp/valid", "views": "camera/eye"}[file.kind]])
     found = ShardContents(file, columns, said, size or path.stat().st_size, rows)
@@ -267,7 +267,7 @@ def _unread_shard(file: ShardFile, manifest: ShardManifest) -> ShardContents:
     return ShardContents(file, {}, said, manifest.size_bytes, manifest.count, manifest.info, manifest.stage_revision)
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return [str(entry) for entry in value]
     return value.item() if isinstance(value, np.generic) else value

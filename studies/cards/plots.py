@@ -26,12 +26,16 @@ _DPI: Final = 110
 def draw(card: Row, tally: Tally, folder: Path) -> dict[str, str]:
     """Write all plots that have data; return their captions by file name, in the order of the card."""
     plots: tuple[tuple[str, str, Callable[[Row, Tally], Any]], ...] = (
-        ("yield.png", "Valid share of validated grasps, by hand and object", _yields),
-        ("quality.png", "Distribution of each quality over the valid grasps, by hand", _qualities),
-        ("directions.png", "Approach directions of the palm, by hand", _directions),
-        ("table.png", "Share of the valid grasps that are clear of the table in at least one scene", _table),
-        ("joints.png", "Range that each joint uses between its limits", _joints),
-        ("sizes.png", "Valid share of validated grasps over the size of the object", _sizes),
+        ("yield.png", "Valid share of validated grasps, by hand and object", _plot_yields),
+        ("quality.png", "Distribution of each quality over the valid grasps, by hand", _plot_qualities),
+        ("directions.png", "Approach directions of the palm, by hand", _plot_directions),
+        (
+            "table.png",
+            "Share of the valid grasps that are clear of the table in at least one scene",
+            _plot_table_scenes,
+        ),
+        ("joints.png", "Range that each joint uses between its limits", _plot_joints),
+        ("sizes.png", "Valid share of validated grasps over the size of the object", _plot_sizes),
     )
     written = {}
     for name, shows, make in plots:
@@ -59,7 +63,7 @@ def _style_axes(axes: Any) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _yields(card: Row, tally: Tally) -> Any:
+def _plot_yields(card: Row, tally: Tally) -> Any:
     hands, objects = _names(card, "hands"), _names(card, "objects")
     shares = np.full((len(objects), len(hands)), np.nan)
     rows = {(cell["hand"], cell["object"]): cell for cell in card["cells"] if cell["of_validated"] is not None}
@@ -84,7 +88,7 @@ def _yields(card: Row, tally: Tally) -> Any:
     return figure
 
 
-def _qualities(card: Row, tally: Tally) -> Any:
+def _plot_qualities(card: Row, tally: Tally) -> Any:
     hands = _names(card, "hands")
     shown = [entry for entry in _QUALITIES if any(entry[1] in card["quality"][hand] for hand in hands)]
     if not shown:
@@ -112,7 +116,7 @@ def _qualities(card: Row, tally: Tally) -> Any:
     return figure
 
 
-def _directions(card: Row, tally: Tally) -> Any:
+def _plot_directions(card: Row, tally: Tally) -> Any:
     """Plot directions of palms: in the object's frame (top row) and by elevation over the table (bottom row)."""
     hands = [hand for hand in _names(card, "hands") if card["directions"]["by_hand"][hand]][:_PANELS]
     if not hands:
@@ -134,7 +138,7 @@ def _directions(card: Row, tally: Tally) -> Any:
         axes.set_title(hand, fontsize=10)
         if with_table and hand in card["elevation"]:
             below = figure.add_subplot(grid[1, column], sharey=below)
-            _elevations(below, card["elevation"][hand], first=column == 0)
+            _plot_elevations(below, card["elevation"][hand], first=column == 0)
     figure.colorbar(mesh, ax=figure.axes[-1 if not with_table else -2], shrink=0.7, label="1: uniform", extend="max")
     figure.suptitle(
         "top: in the object's frame, z up; bottom: elevation over the table", fontsize=9, color=INK, x=0.01, ha="left"
@@ -142,7 +146,7 @@ def _directions(card: Row, tally: Tally) -> Any:
     return figure
 
 
-def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) -> None:
+def _plot_elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) -> None:
     edges = np.linspace(-90, 90, len(sums["all"]) + 1)
     for name, colour, label in (("all", "#cbd5e1", "all pairs"), ("clear", COLOURS[0], "clear of the table")):
         axes.stairs(sums[name], edges, fill=True, color=colour, label=label)
@@ -157,7 +161,7 @@ def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) ->
         axes.figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=8)
 
 
-def _table(card: Row, tally: Tally) -> Any:
+def _plot_table_scenes(card: Row, tally: Tally) -> Any:
     hands, objects = _names(card, "hands"), _names(card, "objects")
     rows = [cell for cell in card["cells"] if cell["clear_of_table"] is not None]
     if not rows:
@@ -179,7 +183,7 @@ def _table(card: Row, tally: Tally) -> Any:
     return figure
 
 
-def _joints(card: Row, tally: Tally) -> Any:
+def _plot_joints(card: Row, tally: Tally) -> Any:
     hands = [hand for hand in _names(card, "hands") if card["joints"].get(hand)][:_PANELS]
     if not hands:
         return None
@@ -204,7 +208,7 @@ def _joints(card: Row, tally: Tally) -> Any:
     return figure
 
 
-def _sizes(card: Row, tally: Tally) -> Any:
+def _plot_sizes(card: Row, tally: Tally) -> Any:
     sizes = {obj["name"]: sorted(obj["extents_m"]) for obj in card["composition"]["objects"] if obj["extents_m"]}
     rows = [cell for cell in card["cells"] if cell["object"] in sizes and cell["of_validated"] is not None]
     if not rows:

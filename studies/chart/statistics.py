@@ -41,21 +41,21 @@ def run_figures(cell: SettingRuns) -> dict[str, Any]:
         "repeats": len(seconds),
     }
     row |= {key: float(np.median(cell.values(key))) for key in MEDIANS}
-    for key, values in _draws(cell).items():
+    for key, values in _bootstrap_draws(cell).items():
         row[f"{key}_low"], row[f"{key}_high"] = np.percentile(values, BAR)
-    widen(row, int(held.sum()), len(held), len(held) / float(seconds.sum()))
-    widen_speed(row, "end_to_end_per_second", int(kept.sum()), len(kept), len(kept) / sum(cell.end_seconds))
+    widen_intervals(row, int(held.sum()), len(held), len(held) / float(seconds.sum()))
+    widen_speed_interval(row, "end_to_end_per_second", int(kept.sum()), len(kept), len(kept) / sum(cell.end_seconds))
     row |= _strict_success(cell) if cell.dexgraspbench else {}
     return {key: rounded_json_value(value) for key, value in row.items()}
 
 
-def widen(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
+def widen_intervals(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
     """Set the bar of success to Wilson's interval; widen the bar of the speed to contain this interval."""
     row["gsr_low"], row["gsr_high"] = wilson_interval(valid, grasps)
-    widen_speed(row, "valid_per_second", valid, grasps, per_second)
+    widen_speed_interval(row, "valid_per_second", valid, grasps, per_second)
 
 
-def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_second: float) -> None:
+def widen_speed_interval(row: dict[str, Any], key: str, valid: int, grasps: int, per_second: float) -> None:
     """Widen the bar of the speed `key` to contain Wilson's interval of the share of valid grasps."""
     low, high = wilson_interval(valid, grasps)
     row[f"{key}_low"] = min(row[f"{key}_low"], low * per_second)
@@ -85,7 +85,7 @@ def seconds_to_valid(share: float, seconds: Sequence[float], grasps: int) -> flo
     return float(np.median(seconds)) / (1.0 - (1.0 - share) ** grasps)
 
 
-def _draws(cell: SettingRuns) -> dict[str, Floats]:
+def _bootstrap_draws(cell: SettingRuns) -> dict[str, Floats]:
     """Bootstrap: resample repeats, then grasps within each."""
     rng = np.random.default_rng(0)
     repeats = len(cell.seconds)
@@ -123,14 +123,14 @@ def summarise_runs(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             # Robustness is undefined for a pair without held grasps.
             known = [r for r in own if r[key] is not None]
             row[key] = float(np.mean([r[key] for r in known])) if known else None
-            row[f"{key}_low"], row[f"{key}_high"] = _bar(known, key) if known else (None, None)
+            row[f"{key}_low"], row[f"{key}_high"] = _error_bar(known, key) if known else (None, None)
         row["valid_per_second"] = valid / seconds
         kept, end = sum(r["kept"] for r in own), sum(sum(r["end_seconds"]) for r in own)
         row["end_to_end_per_second"] = kept / end
         for key, times in zip(SPEEDS, ("seconds", "end_seconds"), strict=True):
             row[f"{key}_low"], row[f"{key}_high"] = (_ratio_bar(own, key, times, side) for side in ("low", "high"))
-        widen(row, valid, row["grasps"], row["grasps_per_second"])
-        widen_speed(row, "end_to_end_per_second", kept, row["grasps"], row["grasps"] / end)
+        widen_intervals(row, valid, row["grasps"], row["grasps_per_second"])
+        widen_speed_interval(row, "end_to_end_per_second", kept, row["grasps"], row["grasps"] / end)
         row["candidates_end_to_end_per_second"] = row["grasps"] / end
         rows.append({key: rounded_json_value(value) for key, value in row.items()})
     mark_fronts(rows, METRICS)
@@ -148,7 +148,7 @@ def mark_fronts(rows: Sequence[dict[str, Any]], metrics: Mapping[str, bool]) -> 
             able[index]["front"].append(key)
 
 
-def _bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:
+def _error_bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:
     """Return the bar of the mean over independent pairs: half-widths added in quadrature."""
     mean = float(np.mean([r[key] for r in runs]))
     down = np.sqrt(np.sum([(r[key] - r[f"{key}_low"]) ** 2 for r in runs])) / len(runs)

@@ -189,33 +189,35 @@ def ring_hand(fingers: int, *, coupling: Coupling = "each joint", size: float = 
     """Return a hand of equal fingers around a palm, of a size relative to a human hand.
     `ratio` is the rotation of a coupled distal joint over that of the middle joint. Raises HandError: unusable."""
     radius, height = (size * x for x in _PALM_M)
-    parts = [f'<robot name="ring"><link name="palm">{_solid("cylinder", -height / 2, radius, height)}</link>']
+    parts = [f'<robot name="ring"><link name="palm">{_shape_element("cylinder", -height / 2, radius, height)}</link>']
     for k in range(fingers):
         angle = 2 * np.pi * k / fingers
         at = f"{radius * np.cos(angle):.6f} {radius * np.sin(angle):.6f} 0"
-        parts += _finger(k, f'<origin xyz="{at}" rpy="0 {_LEAN} {angle:.6f}"/>', coupling, size, ratio)
+        parts += _finger_elements(k, f'<origin xyz="{at}" rpy="0 {_LEAN} {angle:.6f}"/>', coupling, size, ratio)
     files = {"ring.urdf": "\n".join([*parts, "</robot>"]).encode()}
     return load_hand(files, name=f"ring of {fingers}", digest=digest_files(AssetKind.HAND, files))
 
 
-def _finger(k: int, base: str, coupling: Coupling, size: float, ratio: float) -> list[str]:
+def _finger_elements(k: int, base: str, coupling: Coupling, size: float, ratio: float) -> list[str]:
     parts, before = [], "palm"
     for j, (length, end) in enumerate(zip(_LINKS_M, _ENDS, strict=True)):
         name, long = f"finger_{k}_{j}", size * length
-        solid = _solid("cylinder", long / 2, size * _RADIUS_M, long) + _solid("sphere", long, size * _RADIUS_M, 0)
+        solid = _shape_element("cylinder", long / 2, size * _RADIUS_M, long) + _shape_element(
+            "sphere", long, size * _RADIUS_M, 0
+        )
         origin = base if j == 0 else f'<origin xyz="0 0 {size * _LINKS_M[j - 1]:.6f}"/>'
         low, high = sorted((0.0, end * ratio / 0.8)) if j == 2 and coupling == "distal follows" else (0.0, end)
         parts += [
             f'<link name="{name}">{solid}</link>',
             f'<joint name="joint_{k}_{j}" type="revolute"><parent link="{before}"/><child link="{name}"/>{origin}'
             f'<axis xyz="0 -1 0"/><limit lower="{low}" upper="{high}" effort="{_EFFORT * size}" velocity="3"/>'
-            f"{_mimic(k, j, coupling, ratio)}</joint>",
+            f"{_mimic_element(k, j, coupling, ratio)}</joint>",
         ]
         before = name
     return parts
 
 
-def _mimic(k: int, j: int, coupling: Coupling, ratio: float) -> str:
+def _mimic_element(k: int, j: int, coupling: Coupling, ratio: float) -> str:
     """Return the mimic element of a joint that follows another one; empty for driven joints."""
     leads = {
         "each joint": (k, j),
@@ -230,7 +232,7 @@ def _mimic(k: int, j: int, coupling: Coupling, ratio: float) -> str:
     return f'<mimic joint="joint_{lead[0]}_{lead[1]}" multiplier="{follows:.6f}" offset="0"/>'
 
 
-def _solid(kind: str, height: float, radius: float, length: float) -> str:
+def _shape_element(kind: str, height: float, radius: float, length: float) -> str:
     size = f' length="{length:.6f}"' if kind == "cylinder" else ""
     shape = f'<geometry><{kind} radius="{radius:.6f}"{size}/></geometry>'
     return f'<collision><origin xyz="0 0 {height:.6f}"/>{shape}</collision>'

@@ -101,7 +101,7 @@ def draw(one: StabilityMap, path: Path) -> None:
     figure.suptitle(one.title, x=0.01, ha="left", fontsize=13, fontweight="bold")
     figure.draw_without_rendering()
     for axes in grid.flat:
-        _fit(axes)
+        _fit_axes(axes)
     figure.savefig(path, dpi=110)
 
 
@@ -118,8 +118,8 @@ def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
         axes.add_patch(Rectangle((at[0] - 0.46, at[1] - 0.46), 0.92, 0.92, facecolor=fill, **edge))
         axes.text(*at, cell.text, ha="center", va="center", color=ink)
     axes.set(xlim=(-0.5, len(xs) - 0.5), ylim=(-0.5, len(ys) - 0.5))
-    axes.set_xticks(range(len(xs)), [_wrapped(x) for x in xs], fontsize=8)
-    axes.set_yticks(range(len(ys)), [_wrapped(y) for y in ys], fontsize=8)
+    axes.set_xticks(range(len(xs)), [_wrap_label(x) for x in xs], fontsize=8)
+    axes.set_yticks(range(len(ys)), [_wrap_label(y) for y in ys], fontsize=8)
     axes.set_xlabel(one.x, fontsize=9)
     axes.set_ylabel(one.y, fontsize=9)
     axes.set_title(panel, loc="left", fontsize=10)
@@ -135,7 +135,7 @@ def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
         )
 
 
-def _fit(axes: Any) -> None:
+def _fit_axes(axes: Any) -> None:
     """Shrink the numbers to fit their cells, or omit them."""
     left, right = axes.get_xlim()
     room = 0.88 * axes.get_window_extent().width / max(1.0, right - left)
@@ -148,5 +148,5 @@ def _fit(axes: Any) -> None:
             text.set_visible(False)
 
 
-def _wrapped(value: float | str) -> str:
+def _wrap_label(value: float | str) -> str:
     return textwrap.fill(format_tick(value), _TICK_LETTERS, break_long_words=False)

@@ -13,7 +13,7 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import job_id
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.metrics import PerturbedParameter
-from graspd.service.model.planning import PlannedTask, message_of, plan_tasks
+from graspd.service.model.planning import PlannedTask, create_task_message, plan_tasks
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.transforms import pose_to_matrix
@@ -66,7 +66,7 @@ def publish(
     """A task's shard of these columns, in the store and in the index."""
     kind = names.SHARD_KINDS[task.stage]
     data = write_shard(kind, arrays, attributes)
-    message = message_of(record, task, attempt=1, max_attempt=3)
+    message = create_task_message(record, task, attempt=1, max_attempt=3)
     manifest = create_manifest(
         message, data, arrays, attributes, check_columns(kind, arrays), device="cpu", seconds=12.5, worker="worker-1"
     )

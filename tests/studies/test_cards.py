@@ -21,7 +21,7 @@ from graspd.cli import build_app
 from graspd.service.model import names
 from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import BANDS, SECTORS, evenness
-from graspd.service.model.planning import message_of, plan_tasks
+from graspd.service.model.planning import create_task_message, plan_tasks
 from graspd.service.model.records import JobRecord, Snapshot
 from graspd.service.model.states import Stage
 from graspd.service.model.transforms import quat_from_axis_angle
@@ -161,7 +161,7 @@ def _finish(services, record: JobRecord, change: Any) -> None:
             output = Output(columns, place or {"base_shard": task.inputs[0]})
         else:
             output = Output(factories._views(rng, task.count, request), {"scene_shard": task.inputs[0], **place})
-        message = message_of(record, task, attempt=1, max_attempt=3)
+        message = create_task_message(record, task, attempt=1, max_attempt=3)
         manifest, data = build_shard(message, output, device="cpu", seconds=SECONDS[task.stage], worker="w1")
         publish_shard(services.store, manifest, data)
         services.index.write.add_manifests([manifest])

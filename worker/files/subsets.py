@@ -16,7 +16,7 @@ from graspd.service.cli import load_settings
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.readers import Shards, open_shards
 from graspd.service.store import validity
-from graspd.service.store.shards import Shard, part_of_shard, read_shard, relative_path_of
+from graspd.service.store.shards import Shard, read_shard, relative_path_of, shard_bytes_of_rows
 from graspd.service.store.store import open_store
 
 #: Function from the base shards of one hand on one object to a mask (N,) for each shard.
@@ -54,7 +54,7 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
         for shard, mask in zip(together, choose(together), strict=True):
             looked_at, kept = looked_at + len(mask), kept + int(mask.sum())
             if mask.any():
-                ready.append((relative_path_of(shard, {one for one, _ in ready}), part_of_shard(shard, mask)))
+                ready.append((relative_path_of(shard, {one for one, _ in ready}), shard_bytes_of_rows(shard, mask)))
     if not ready:
         raise InputError(f"none of {looked_at} grasps is selected")
     for path, data in ready:

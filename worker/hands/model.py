@@ -18,7 +18,7 @@ from graspd.worker.hands.primitives import HandFeatures
 from graspd.worker.hands.robot import Ints, Joint
 from graspd.worker.hands.tendons import Tendon
 from graspd.worker.hands.visuals import NO_VISUALS, Visuals
-from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_of
+from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_digest
 
 
 class JointType(IntEnum):
@@ -120,7 +120,7 @@ class HandModel:
     @cached_property
     def content(self) -> str:
         """Digest of all fields that `content_of` includes; `digest` is the digest of the source files."""
-        return content_of(self)
+        return content_digest(self)
 
     @cached_property
     def features(self) -> HandFeatures:

@@ -193,11 +193,11 @@ def _decompose(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool]
 def _is_convex(vertices: Floats, faces: Ints) -> bool:
     """Check whether nearly all of the surface lies on the hull, so that no decomposition is needed."""
     normals, offsets = hull_planes(*hull(vertices[np.unique(faces)]))
-    depth = (offsets - _sample(vertices, faces) @ normals.T).min(axis=1)
+    depth = (offsets - _sample_surface(vertices, faces) @ normals.T).min(axis=1)
     return float(np.quantile(depth, _SHARE)) < _FLAT_M
 
 
-def _sample(vertices: Floats, faces: Ints) -> Floats:
+def _sample_surface(vertices: Floats, faces: Ints) -> Floats:
     areas = face_areas(vertices, faces)
     ladder = (np.arange(_POINTS) + 0.5) / _POINTS * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder), len(faces) - 1)
@@ -208,7 +208,7 @@ class _OpenSurface:
     """Points on a mesh with the directions in which each is visible from outside."""
 
     def __init__(self, vertices: Floats, faces: Ints) -> None:
-        corners, self._points = vertices[faces], _sample(vertices, faces)
+        corners, self._points = vertices[faces], _sample_surface(vertices, faces)
         # (D, P) whether a ray in a direction from a point misses the mesh.
         self._sees = np.array([~_hit_mask(self._points, direction, corners) for direction in _DIRECTIONS])
 

@@ -16,7 +16,7 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert
 from graspd.worker.hands import kinematics, primitives
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import ConvexPiece, HandModel, SurfacePoints
-from graspd.worker.objects.disk_cache import cached_arrays, content_of
+from graspd.worker.objects.disk_cache import cached_arrays, content_digest
 from graspd.worker.objects.memory_cache import cached_by_content
 
 #: Candidates per point. Thinning keeps one in five, evenly spread.
@@ -46,7 +46,7 @@ class _Shapes:
 
     @cached_property
     def content(self) -> str:
-        return content_of(self)
+        return content_digest(self)
 
 
 @cached_by_content(64)
@@ -59,11 +59,11 @@ def _cached_samples(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
 def _sample(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
     from scipy.spatial import cKDTree
 
-    bodies, candidates = len(shapes.rest), _candidates(shapes, max(OVERSAMPLING * count, MIN_CANDIDATES), seed)
+    bodies, candidates = len(shapes.rest), _exposed_points(shapes, max(OVERSAMPLING * count, MIN_CANDIDATES), seed)
     if len(candidates) < count:
         # Most of the surface is hidden inside other pieces: sample once more, in proportion.
         more = max(OVERSAMPLING * count, MIN_CANDIDATES) * count * OVERSAMPLING // max(len(candidates), 1)
-        candidates = _candidates(shapes, min(more, 5_000_000), seed)
+        candidates = _exposed_points(shapes, min(more, 5_000_000), seed)
     if len(candidates) < count:
         raise HandError(
             f"the outer surface of the hand gives {len(candidates)} points where {count} are needed: its pieces lie "
@@ -88,7 +88,7 @@ def _sample(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
     )
 
 
-def _candidates(hand: _Shapes, count: int, seed: int) -> SurfacePoints:
+def _exposed_points(hand: _Shapes, count: int, seed: int) -> SurfacePoints:
     """Return about `count` area-uniform points on the pieces, without buried ones."""
     rng = np.random.default_rng([seed, 0x5EED])
     shares = np.array([primitives.area(p.kind, p.size, p.vertices, p.faces) for p in hand.pieces])

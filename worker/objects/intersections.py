@@ -47,7 +47,7 @@ def intersecting_faces(vertices: Floats, faces: Indices) -> Indices | None:
     if tree.count_neighbors(tree, 2 * radius) > 2 * MAX_PAIRS:
         return None
     near = owner[tree.query_pairs(2 * radius, output_type="ndarray")]
-    near = _distinct(near[(near[:, 0] != near[:, 1]) & _box_overlap_mask(corners, near)], len(faces))
+    near = _unique_pairs(near[(near[:, 0] != near[:, 1]) & _box_overlap_mask(corners, near)], len(faces))
     apart = ~(faces[near[:, 0]][:, :, None] == faces[near[:, 1]][:, None, :]).any(axis=(1, 2))
     near = near[apart]
     depth = DEPTH * float(np.ptp(vertices, axis=0).max())
@@ -59,7 +59,7 @@ def intersecting_faces(vertices: Floats, faces: Indices) -> Indices | None:
     return near[np.concatenate(found)]
 
 
-def _distinct(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+def _unique_pairs(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     """Return unordered pairs (P, 2) of numbers below `count` once each, in ascending order.
     Pairs encoded as one number sort many times faster than rows."""
     keys = np.unique(pairs.min(axis=1) * np.int64(count) + pairs.max(axis=1))

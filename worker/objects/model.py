@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import MeshError
 from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG
 from graspd.service.model.transforms import Floats
-from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_of
+from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_digest
 
 Ints = NDArray[np.int32]
 
@@ -45,7 +45,7 @@ class ObjectModel:
     @cached_property
     def content(self) -> str:
         """Digest of the prepared model; `digest` is that of the file, equal for every fidelity."""
-        return content_of(self)
+        return content_digest(self)
 
     @property
     def centred(self) -> ObjectModel:

@@ -50,14 +50,14 @@ def serve(connection: Connection, modules: Sequence[str]) -> None:
             import_module(name)
     kept: dict[str, Any] = {}
     while True:
-        answer = _answer(orders.get(), kept)
+        answer = _process_order(orders.get(), kept)
         try:
             connection.send_bytes(answer)
         except OSError:
             os._exit(0)
 
 
-def _answer(order: bytes, kept: dict[str, Any]) -> bytes:
+def _process_order(order: bytes, kept: dict[str, Any]) -> bytes:
     try:
         wanted: WorkItem = pickle.loads(order)
         for key in wanted.forget:

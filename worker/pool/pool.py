@@ -100,7 +100,7 @@ class Pool(AbstractContextManager["Pool"]):
         request = _Request(work, key, shared, done)
         with self._changing:
             wanted = () if self._closed else enumerate(parts)
-            futures = [self._threads.submit(self._do, request, number, part) for number, part in wanted]
+            futures = [self._threads.submit(self._run_part, request, number, part) for number, part in wanted]
         try:
             while True:
                 _, left = wait(futures, _LOOK_S, FIRST_EXCEPTION)
@@ -124,7 +124,7 @@ class Pool(AbstractContextManager["Pool"]):
         for place in self._places:
             place.end()
 
-    def _do(self, request: _Request, number: int, part: Any) -> Any:
+    def _run_part(self, request: _Request, number: int, part: Any) -> Any:
         place = self._idle.get()
         try:
             made = place.run_item(request, part)
@@ -162,7 +162,7 @@ class _Slot:
                 self._stop()
                 self.start()
             assert self._connection is not None
-            self._connection.send_bytes(pickle.dumps(self._order(request, part)))
+            self._connection.send_bytes(pickle.dumps(self._work_item(request, part)))
             while not self._connection.poll(_LOOK_S):
                 if (since := request.dropped_at) is not None and time.monotonic() - since > _PATIENCE_S:
                     log.warning("a process does not end an abandoned item; it is killed")
@@ -182,7 +182,7 @@ class _Slot:
             return True
         return self._connection.poll()
 
-    def _order(self, request: _Request, part: Any) -> WorkItem:
+    def _work_item(self, request: _Request, part: Any) -> WorkItem:
         forget = list[str]()
         known = request.key in self._kept
         self._kept[request.key] = None

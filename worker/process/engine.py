@@ -85,7 +85,7 @@ class Engine:
         elif word == "check":
             self._send("ready", self._check_engine())
         else:
-            self._do(about)
+            self._run_task(about)
 
     def update(self, **facts: str | float) -> None:
         self._send("facts", facts)
@@ -119,7 +119,7 @@ class Engine:
     def _wait_in_quarantine(self, stages: Collection[Stage]) -> bool:
         return self._fitness.wait_in_quarantine(stages, self.update, lambda: self._reason is not None)
 
-    def _do(self, raw: dict[str, Any]) -> None:
+    def _run_task(self, raw: dict[str, Any]) -> None:
         context = self._surroundings.context(raw, self.update)
         with self._changing:
             self._context = context

@@ -77,12 +77,12 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     def check_service(self) -> None:
         """Raise BusyError if Redis belongs to another service, InputError if the device is unknown."""
         self._engine.send("service", self._queue.service_id())
-        self._await("service")
+        self._wait_for_answer("service")
 
     def admit(self) -> bool:
         """Wait for the engine's check before the first task; False if the worker must end. Raises EngineLost."""
         self._engine.send("check")
-        return bool(self._await("ready"))
+        return bool(self._wait_for_answer("ready"))
 
     def execute_job(self, job: Any, queue: Any) -> None:
         """Run one task under a lease. Its outcome is sent after the lease is released."""
@@ -92,7 +92,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         outcome: Event | None = None
         self._engine.send("task", job.args[0])
         try:
-            outcome = self._await("done", partial(self._keep_lease, job))
+            outcome = self._wait_for_answer("done", partial(self._keep_lease, job))
         except GraspdError as error:
             log.warning("the engine refuses a task: %s", error)
         except EngineLost as error:
@@ -104,13 +104,13 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self.tasks_done += 1
         if outcome is not None:
             self._publish(outcome)
-        self.engine_is = self._await("idle")
+        self.engine_is = self._wait_for_answer("idle")
         if self.engine_is != "fit":
             self._heartbeat.update(state="stopping")
             raise StopRequested
         self.set_state(WorkerStatus.IDLE)
 
-    def _await(self, word: str, beat: Callable[[], None] = lambda: None) -> Any:
+    def _wait_for_answer(self, word: str, beat: Callable[[], None] = lambda: None) -> Any:
         """Return the engine's answer within the time limit of a task; pass on its other messages meanwhile."""
         began = time.monotonic()
         due = began + self._heartbeat.interval_s

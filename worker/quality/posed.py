@@ -38,7 +38,7 @@ class PostureData:
         with wp.ScopedDevice(self.device):
             for module in (touching, balance, opening, jamming, optimizers):
                 wp.load_module(module=module, device=self.device)
-            self.chain, self.points = chain_of(probe.hand, self.device), _points(probe)
+            self.chain, self.points = chain_of(probe.hand, self.device), _upload_points(probe)
             self.effort = wp.array(probe.hand.effort, dtype=wp.float64)
             self.finger = wp.array(finger, dtype=wp.int32)  # (L,) finger of each body; -1 without finger
 
@@ -89,7 +89,7 @@ class PostureData:
         return found
 
 
-def _points(probe: Probe) -> Any:
+def _upload_points(probe: Probe) -> Any:
     points, out = probe.points, touching.Points()
     order = np.argsort(points.body, kind="stable")
     out.first = wp.array(np.searchsorted(points.body[order], np.arange(probe.hand.bodies + 1)), dtype=wp.int32)

@@ -31,7 +31,7 @@ from graspd.service.store.manifests import INDEX_THRESHOLD_M
 from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel, JointType
-from graspd.worker.objects.disk_cache import content_of
+from graspd.worker.objects.disk_cache import content_digest
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.contact import (
     LINK_CONTACT_M,
@@ -121,7 +121,7 @@ class _Terms:
     @cached_property
     def pair(self) -> _Pair:
         """Prepared hand and object, cached because a batch is measured in chunks of a few grasps."""
-        content = content_of(self)
+        content = content_digest(self)
         with _lock:
             if content not in _pairs:
                 _pairs[content] = _Pair(self)
@@ -136,7 +136,7 @@ def _measure_chunks(terms: _Terms, postures: Sequence[Posture], done: Count, run
     if run.pool is not None:
         return run.pool.map(
             _columns,
-            content_of(terms),
+            content_digest(terms),
             terms,
             postures,
             cancelled=run.cancelled,

@@ -92,7 +92,7 @@ def _render_sides(
     sides = []
     for azimuth in azimuths:
         angles = np.array([side_azimuth(hand, world) + azimuth for world in bodies])
-        cameras = np.stack([_camera(obj, points[w], angles[w], k, size) for w in range(worlds)])
+        cameras = np.stack([_fit_grasp_camera(obj, points[w], angles[w], k, size) for w in range(worlds)])
         sides.append(stage.render(studio_shot(cameras, k, size, angles, samples), run.without_progress()).rgb)
     return np.stack(sides, axis=1)
 
@@ -137,7 +137,7 @@ def side_azimuth(hand: HandModel, bodies: Floats) -> float:
     return float(np.arctan2(flat[1], flat[0]) + 0.5 * np.pi)
 
 
-def _camera(obj: ObjectModel, points: Floats, angle: float, k: Floats, size: tuple[int, int]) -> Floats:
+def _fit_grasp_camera(obj: ObjectModel, points: Floats, angle: float, k: Floats, size: tuple[int, int]) -> Floats:
     middle = 0.5 * (obj.hull_vertices.min(axis=0) + obj.hull_vertices.max(axis=0))
     reach = np.linalg.norm(obj.hull_vertices - middle, axis=1).max()
     return fit_camera(points[np.linalg.norm(points - middle, axis=1) < reach + NEAR_M], angle, k, size)

@@ -37,11 +37,11 @@ def neighbour_of(obj: ObjectModel) -> Neighbour:
         middle, by = neighbour_of(obj.centred), np.array([*obj.centre, 1.0, 0, 0, 0])
         pieces = tuple(piece + by[:3] for piece in middle.pieces)
         return Neighbour(obj, pieces, tuple(solid.moved(by) for solid in middle.solids), middle.error_m, middle)
-    return replace(_neighbour(obj), obj=obj)  # the same mesh may have another name
+    return replace(_build_neighbour(obj), obj=obj)  # the same mesh may have another name
 
 
 @cached_by_content(32)
-def _neighbour(obj: ObjectModel) -> Neighbour:
+def _build_neighbour(obj: ObjectModel) -> Neighbour:
     try:
         pieces = decompose(obj).vertices
     except MeshError:

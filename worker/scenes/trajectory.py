@@ -103,7 +103,7 @@ def plan_free_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet) ->
     nowhere = PlacedGrasps((), IDENTITY_POSE[None], np.zeros(len(grasps), np.intp))
     wide = _open_pregrasps(probe, grasps.pregrasp, wide_open_joints(hand, obj, grasps.pregrasp, nowhere))
     pointing = quat_rotate(wide.hand_pose[:, 3:], hand.palm.approach)
-    ways = [-pointing, *(_tilted(-pointing, tilt, side) for tilt in TILTS for side in range(SIDES))]
+    ways = [-pointing, *(_tilt_axes(-pointing, tilt, side) for tilt in TILTS for side in range(SIDES))]
     path, _, touching, chosen = _plan_approach(probe, wide, nowhere.scenes[0], ways)
     raised = np.array(grasps.squeeze.hand_pose, float)
     raised[:, :3] += STANDOFF_M * chosen
@@ -129,7 +129,7 @@ def _unit(ways: Floats, instead: Floats) -> Floats:
     return np.where(length > 1e-6, ways / np.maximum(length, 1e-6), instead)
 
 
-def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
+def _tilt_axes(axis: Floats, tilt: float, side: int) -> Floats:
     """Return unit vectors (n, 3) tilted by `tilt` [rad] from axes (n, 3), towards side number `side`."""
     least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
     across = _unit(np.cross(axis, least), least)
@@ -137,7 +137,7 @@ def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
     return quat_rotate(quat_from_axis_angle(axis, np.full(len(axis), 2 * np.pi * side / SIDES)), leaning)
 
 
-def _retreat(hand_pose: Floats, way: Floats, steps: int) -> Floats:
+def _retreat_poses(hand_pose: Floats, way: Floats, steps: int) -> Floats:
     """Return poses (n, steps, 7) from `STANDOFF_M` along directions `way` (n, 3) to the hands' poses."""
     poses = np.repeat(hand_pose[:, None], steps, axis=1)
     poses[..., :3] += np.linspace(STANDOFF_M, 0.0, steps)[:, None] * way[:, None]
@@ -154,7 +154,7 @@ def _plan_approach(
     chosen, open_ = np.zeros((count, 3)), np.arange(count)
     for tried in ways:
         way = tried[open_]
-        poses = _retreat(pregrasp.hand_pose[open_], way, looks)
+        poses = _retreat_poses(pregrasp.hand_pose[open_], way, looks)
         joints = np.repeat(pregrasp.joint_positions[open_], looks, axis=0)
         postures = Posture(poses.reshape(-1, 7), joints)
         room = obstacle_clearance(probe.hand, postures, [scene]).reshape(len(open_), looks).min(axis=1)
@@ -168,7 +168,7 @@ def _plan_approach(
         open_ = open_[best[open_] < MARGIN_M]
         if not len(open_):
             break
-    return _retreat(pregrasp.hand_pose, chosen, WAYPOINTS), least, touching, chosen
+    return _retreat_poses(pregrasp.hand_pose, chosen, WAYPOINTS), least, touching, chosen
 
 
 def _object_distances(probe: Probe, postures: Posture) -> Floats:
@@ -218,7 +218,7 @@ def plan_open_approach(
         open_ = open_[best[open_] < MARGIN_M + 0.1 * OBJECT_WANTED_M - 1e-9]
         if not len(open_):
             break
-    return _retreat(pregrasp.hand_pose, chosen, WAYPOINTS), joints, least, touching
+    return _retreat_poses(pregrasp.hand_pose, chosen, WAYPOINTS), joints, least, touching
 
 
 def _retreat_clearance(

@@ -41,7 +41,7 @@ _MODEL_CPU_S: Final = 8.0  # CPU time of a check [s] above which the first task 
 
 def run(message: IngestMessage, context: TaskContext) -> None:
     """Check the asset and write `check.json`, also for a refusal."""
-    files = _files(message, context)
+    files = _load_files(message, context)
     found, model = check_in_child(message.kind, message.name, files, context)
     if found["verdict"] != "refuse" and load_asset(context.store, message.kind, message.digest).self_test:
         from graspd.worker.hands.load import load_hand
@@ -55,7 +55,7 @@ def run(message: IngestMessage, context: TaskContext) -> None:
     put_document(context.store, names.asset_check_key(message.kind, message.digest), found)
 
 
-def _files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:
+def _load_files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:
     if message.kind is AssetKind.HAND:
         from graspd.worker.stages.assets import load_hand_files
 

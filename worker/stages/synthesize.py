@@ -38,7 +38,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     hand, obj = assets.hand_of(context.store, message), assets.object_of(context.store, message)
     assets.cache_network(context.store, message)
     columns = _scene_columns(message, context)
-    scenes = [_scenes(message, part, context) for part in columns]
+    scenes = [_build_scenes(message, part, context) for part in columns]
     context.check()
     try:
         found = validated_batches(
@@ -59,7 +59,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         if scenes and type(error) in (InputError, NoStartFound):
             raise SceneError(str(error)) from None
         raise
-    made = [_output(one, part) for one, part in zip(found, columns or [{}] * len(found), strict=True)]
+    made = [_create_output(one, part) for one, part in zip(found, columns or [{}] * len(found), strict=True)]
     attributes = base_attributes(
         hand,
         obj,
@@ -74,7 +74,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     return replace(whole, attributes={**whole.attributes, **attributes, **of_scenes})
 
 
-def _output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Output:
+def _create_output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Output:
     info: dict[str, Any] = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
     info |= {name: round(value, 4) for name, value in found.shares.items()}
     info |= {"rejected": found.rejected, "outcomes": found.outcomes, "planned": found.planned}
@@ -97,7 +97,7 @@ def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str,
     return [{name: column[number] for name, column in parts.items()} for number in range(count)]
 
 
-def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: TaskContext) -> Scenes:
+def _build_scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: TaskContext) -> Scenes:
     scenes = Scenes(supports_of(message.request.scene_spec), columns["scene/object_pose"])
     if not (others := assets.neighbours_of(context.store, message)):
         return scenes

@@ -78,16 +78,16 @@ class Lift(Test):
     def dexgraspbench(self, grasps: GraspSet, row: int) -> LiftResult:  # type: ignore[override]
         """Run the published test: one check of the object's world pose, after the rise."""
         self._in_hand = False
-        if (rollout := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
+        if (rollout := self._set_up_scene(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
             return rollout
         self._close(grasps, row)
         self._rise(grasps, row, np.arange(1, STAGES + 1) / STAGES, STAGE_S)
-        return self._result(rollout, self._validate(Rollout()))
+        return self._complete_result(rollout, self._validate(Rollout()))
 
     def lift(self, grasps: GraspSet, row: int) -> LiftResult:
         """Run the test from the standoff to the end of the hold, along `grasps.approach`."""
         self._in_hand = True
-        if (rollout := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
+        if (rollout := self._set_up_scene(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
             return rollout
         if self._collides_on_approach(grasps, row):
             rollout.outcome = LiftOutcome.TOUCHED_ON_THE_WAY
@@ -99,26 +99,26 @@ class Lift(Test):
         self._rise(grasps, row)
         if (outcome := self._validate(Rollout())) is Outcome.HELD:
             outcome = self._hold(Rollout())
-        rollout = self._result(rollout, outcome)
+        rollout = self._complete_result(rollout, outcome)
         if rollout.success and self._neighbours_moved():
             rollout.outcome = LiftOutcome.NEIGHBOUR_MOVED
         return rollout
 
-    def _begin(self, grasps: GraspSet, row: int) -> LiftResult:
+    def _set_up_scene(self, grasps: GraspSet, row: int) -> LiftResult:
         """Set up the grasp's scene with all objects at rest; gravity acts on objects but not on the hand."""
         self._steps, number = 0, int(self.placed.index[row])
         self._scene_pose = invert(np.asarray(self.placed.object_pose[number], float))
         self._up = self.placed.scenes[number].up
         self._beside = self.placed.relative_neighbour_poses(number)
         self._goal = np.zeros(3)
-        self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
+        self._set_posture(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
         mujoco.mj_forward(self.scene.model, self.data)
         rollout = LiftResult()
         if max(self.penetration()) > MAX_PENETRATION_M:
             rollout.outcome = LiftOutcome.PENETRATION
         return rollout
 
-    def _put(self, hand_pose: Floats, joints: Floats) -> None:
+    def _set_posture(self, hand_pose: Floats, joints: Floats) -> None:
         self.scene.place(self.data, hand_pose, joints)
         self.data.mocap_pos[1], self.data.mocap_quat[1] = self._scene_pose[:3], self._scene_pose[3:]
         self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push_force * self._up
@@ -151,7 +151,7 @@ class Lift(Test):
         return any(self._in_contact(*blend(wide, closed, 0, float(share))) for share in shares)
 
     def _in_contact(self, hand_pose: Floats, joints: Floats) -> bool:
-        self._put(hand_pose, joints)
+        self._set_posture(hand_pose, joints)
         mujoco.mj_kinematics(self.scene.model, self.data)
         mujoco.mj_collision(self.scene.model, self.data)
         contact = self.data.contact
@@ -173,12 +173,12 @@ class Lift(Test):
             self._goal = share * RISE_M * self._up
             self.data.mocap_pos[0] = root[:3] + self._goal
             self._run(step_s)
-            if self._in_hand and number % LOSSES == 0 and self._is_lost():
+            if self._in_hand and number % LOSSES == 0 and self._is_dropped():
                 break
 
-    def _offset(self) -> Floats:
+    def _object_displacement(self) -> Floats:
         """Return the displacement (3,) of the object's frame from its commanded position [m]."""
-        at, yielded = super()._offset(), self._root_deviation()
+        at, yielded = super()._object_displacement(), self._root_deviation()
         if yielded is not None:
             root, turn = yielded
             at = self.data.mocap_pos[0] + quat_rotate(quat_conjugate(turn), at - root)
@@ -198,8 +198,8 @@ class Lift(Test):
         root = self.data.qpos[at : at + 7]
         return root[:3], quat_multiply(root[3:], quat_conjugate(self.data.mocap_quat[0]))
 
-    def _result(self, rollout: LiftResult, outcome: Outcome) -> LiftResult:
-        rollout.steps, rollout.margin = self._steps, self._excess()
+    def _complete_result(self, rollout: LiftResult, outcome: Outcome) -> LiftResult:
+        rollout.steps, rollout.margin = self._steps, self._motion_excess()
         rollout.outcome = _OUTCOMES[outcome]
         return rollout
 

@@ -134,7 +134,7 @@ class PushPayload(_WeightTest):
     def payload(self, grasps: GraspSet, row: int) -> float:
         """Return the payload [kg]; nan if the grasp does not hold the object under the pushes."""
         self._set_mass(self._own)
-        if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
+        if self._set_up_test(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return math.nan
         if not self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) or is_invalid(self.data):
             return math.nan
@@ -265,7 +265,7 @@ class Shake(FixedRootTest):
                 force = -self.scene.mass * (ACCELERATION * self._up + jerked)
                 self.data.xfrc_applied[self.scene.object_body, :3] = force
                 self._run(STEP_S)
-                worst = max(worst, LOST if is_invalid(self.data) else self._excess())
+                worst = max(worst, LOST if is_invalid(self.data) else self._motion_excess())
                 if worst >= 1.0:
                     return worst
         return worst

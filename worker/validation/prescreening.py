@@ -68,7 +68,7 @@ class ShortLiftTest(Lift):
         """Return the ratio of motion to its limit after hanging at half friction; below 1 if lifted.
         Otherwise return the ratio at full friction plus `SLIPS`, or `beat` if `beat` is below 1 + `SLIPS`."""
         self.scene = self._half
-        if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
+        if self._set_up_scene(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return DEEP
         if not self._close(grasps, row, give_up=True, stages=CLOSING) or is_invalid(self.data):
             return LOST
@@ -101,7 +101,7 @@ class ShortPushTest(Test):
         """Return the largest ratio of motion to its limit in pushes at half friction; below 1 if held.
         Otherwise return the ratio at full friction plus `SLIPS`, or inf as soon as the score cannot be below `beat`."""
         self.scene = self._half
-        if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
+        if self._set_up_test(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return DEEP
         if not self._close(grasps, row, give_up=True, stages=FREE_CLOSING) or is_invalid(self.data):
             return LOST
@@ -121,7 +121,7 @@ class ShortPushTest(Test):
             self._restore()
             self.data.xfrc_applied[self.scene.object_body, :3] = PULL * self.scene.push_force * corner
             self._run(PUSHED * STAGE_S)
-            worst = max(worst, LOST if is_invalid(self.data) else self._excess())
+            worst = max(worst, LOST if is_invalid(self.data) else self._motion_excess())
             if worst >= enough:
                 break
         return worst
@@ -172,7 +172,7 @@ class FixedRootTest(Lift):
 
     def _closed(self, grasps: GraspSet, row: int) -> bool:
         """Close the hand around the object; return whether the object stays in the hand."""
-        if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
+        if self._set_up_scene(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return False
         return self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) and not is_invalid(self.data)
 

@@ -315,8 +315,8 @@ class VariantLift(_DelayedFingersTest, Lift):
         super().__init__(scene, placed)
         self._weight, self._lags = variant.mass, lags
 
-    def _put(self, hand_pose: Floats, joints: Floats) -> None:
-        super()._put(hand_pose, joints)
+    def _set_posture(self, hand_pose: Floats, joints: Floats) -> None:
+        super()._set_posture(hand_pose, joints)
         self.data.xfrc_applied[self.scene.object_body, :3] *= self._weight
 
 

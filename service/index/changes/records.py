@@ -11,7 +11,7 @@ from typing import Any, Final
 from sqlalchemy import ColumnElement, Connection, Table, delete, exists, func, literal, select, tuple_, update
 
 from graspd.service.index.database import IndexPart, chunks, rows_in, update_rows, upsert
-from graspd.service.index.outbox import append_ends
+from graspd.service.index.outbox import append_end_events
 from graspd.service.index.tables import (
     assets,
     attempts,
@@ -276,7 +276,7 @@ def _derive_job_states(connection: Connection, ids: Sequence[str]) -> dict[str, 
                 about = {"kind": "job", "subject": job, "state": state.value}
                 ended.append(about | {"project": row["project"], "owner": row["owner"]})
     if not connection.get_execution_options().get(QUIET):
-        append_ends(connection, ended)
+        append_end_events(connection, ended)
     return states
 
 

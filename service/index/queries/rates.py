@@ -133,7 +133,7 @@ class Rates:
                 bytes_per_grasp=sum(b.size_bytes for b in batches) / max(1, sum(b.count for b in batches)),
                 origin=f"measured here: {words}, {devices}",
                 batches=len(batches),
-                spread=_spread([batch.seconds / batch.candidates for batch in batches], MEASURED_SPREAD),
+                spread=_relative_deciles([batch.seconds / batch.candidates for batch in batches], MEASURED_SPREAD),
             )
         return self._known[key]
 
@@ -185,7 +185,7 @@ def measure_machine(batches: Iterable[BatchCost]) -> Machine:
     ]
     if not ratios:
         return Machine()
-    return Machine(median(ratios), _spread(ratios, (1.0, 1.0)), len(ratios))
+    return Machine(median(ratios), _relative_deciles(ratios, (1.0, 1.0)), len(ratios))
 
 
 def _has_stored_rate(request: JobOptions) -> bool:
@@ -196,7 +196,7 @@ def _has_stored_rate(request: JobOptions) -> bool:
     )
 
 
-def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, float]:
+def _relative_deciles(values: list[float], least: tuple[float, float]) -> tuple[float, float]:
     """Return the first and last decile of the values, divided by the median; at least as wide as `least`."""
     if len(values) < 2 or (middle := median(values)) <= 0:
         return least
@@ -236,7 +236,7 @@ def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machi
         return _rate_on_machine(machine, STORED_PLACE if options.in_scene else STORED_SCENE)
     scenes = sum(batch.batches * batch.request.scenes for batch in found)
     seconds = sum(batch.seconds for batch in found) / scenes
-    spread = _spread([one.seconds / (one.batches * one.request.scenes) for one in found], MEASURED_SPREAD)
+    spread = _relative_deciles([one.seconds / (one.batches * one.request.scenes) for one in found], MEASURED_SPREAD)
     return StageRate(seconds, sum(b.size_bytes for b in found) / rows, "measured here", len(found), spread)
 
 
@@ -250,4 +250,4 @@ def picture_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Mac
     seconds = sum(batch.seconds for batch in found) / megapixels
     each = [batch.seconds / number for batch, number in zip(found, pixels, strict=True)]
     sizes = sum(batch.size_bytes for batch in found) / megapixels
-    return StageRate(seconds, sizes, "measured here", len(found), _spread(each, MEASURED_SPREAD))
+    return StageRate(seconds, sizes, "measured here", len(found), _relative_deciles(each, MEASURED_SPREAD))

@@ -22,7 +22,14 @@ from graspd.service.model.digests import digest_json
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.projects import EVERYTHING, ProjectScope
-from graspd.service.model.records import DatasetMember, DatasetRecord, ObjectSet, Snapshot, job_of, object_set_of
+from graspd.service.model.records import (
+    DatasetMember,
+    DatasetRecord,
+    ObjectSet,
+    Snapshot,
+    create_job_record,
+    create_object_set,
+)
 from graspd.service.model.scene_spec import NamedNeighbour, SceneDocument
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline import job_actions
@@ -178,7 +185,7 @@ def add_object_set(
             owner, project = known.owner, known.project
             may_follow(owner, project)
         refuse_deleted(services, [(AssetKind.OBJECT, one.digest) for one in assets], connection)
-        found = object_set_of(name, wanted, after=after, owner=owner, project=project)
+        found = create_object_set(name, wanted, after=after, owner=owner, project=project)
         if not put(key := names.object_set_key(name, found.digest), found):
             # An earlier request was interrupted before it wrote the row.
             found = read_record(ObjectSet, services.store, key)
@@ -267,7 +274,7 @@ class DatasetController:
             for cell in cells:
                 if self._clock() > deadline:
                     return False
-                job = job_of(cell, work.options, work.revisions, work.owner, work.project)
+                job = create_job_record(cell, work.options, work.revisions, work.owner, work.project)
                 job_actions.enter_job(self._services, self._ranges.with_span(job, among=len(cells)), keeps_assets=True)
                 after = cell.position
         self._services.index.write_dataset.set_progress(work.name, planned=True)

@@ -33,7 +33,7 @@ from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest
 from graspd.service.model.errors import LimitError
 from graspd.service.model.planning import stages_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
-from graspd.service.model.records import request_of
+from graspd.service.model.records import create_job_request
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.datasets.spec import MAX_CELLS, Estimate, Matrix, RateUsed, WorkersPlan
 
@@ -81,7 +81,7 @@ def estimate(
     sums = _Sums()
     for hand in matrix.hands:
         for obj in objects:
-            chosen = resolve(request_of(options, hand, obj))
+            chosen = resolve(create_job_request(options, hand, obj))
             if chosen.resolved_fidelity.name not in rates:
                 rates[chosen.resolved_fidelity.name] = Rates(batches, chosen, devices)
             sums.machine = rates[chosen.resolved_fidelity.name].machine

@@ -13,7 +13,7 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json, job_id
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.fidelity import AUTO
-from graspd.service.model.records import DatasetMember, DatasetRecord, FidelityChoice, request_of
+from graspd.service.model.records import DatasetMember, DatasetRecord, FidelityChoice, create_job_request
 from graspd.service.model.renamed import original_request
 from graspd.service.model.states import Stage
 from graspd.service.model.version import STAGE_REVISIONS
@@ -68,7 +68,9 @@ def create_record(
 
     `choose` replaces the fidelity `auto` of a cell, or raises InputError if none meets the target.
     """
-    cells = [(hand, obj, *choose(request_of(options, hand.name, obj.name))) for hand in hands for obj in objects]
+    cells = [
+        (hand, obj, *choose(create_job_request(options, hand.name, obj.name))) for hand in hands for obj in objects
+    ]
     fidelities = tuple(str(request.fidelity) for _, _, request, _ in cells) if options.fidelity == AUTO else ()
     found = [choice for *_, choice in cells if choice is not None]
     places = {choice: place for place, choice in enumerate(dict.fromkeys(found))}

@@ -61,7 +61,7 @@ def test_open_hand_touches_nothing_of_a_free_object_on_its_way(free: Executions)
                 place = (1 - share) * a.hand_pose[row, :3] + share * b.hand_pose[row, :3]
                 turn = slerp(a.hand_pose[row, 3:], b.hand_pose[row, 3:], float(share))
                 joints = (1 - share) * a.joint_positions[row] + share * b.joint_positions[row]
-                rollout._put(np.concatenate([place, turn]), joints)
+                rollout._set_posture(np.concatenate([place, turn]), joints)
                 mujoco.mj_forward(rollout.scene.model, rollout.data)
                 assert rollout.penetration()[0] < 0.002
 

@@ -4,7 +4,7 @@ from graspd.service.index.rebuild import rebuild
 from graspd.service.index.views import UsageDay
 from graspd.service.model import names
 from graspd.service.model.messages import Origin
-from graspd.service.model.planning import RoundRobin, message_of, plan_tasks
+from graspd.service.model.planning import RoundRobin, create_task_message, plan_tasks
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import Priority
@@ -28,7 +28,8 @@ def enter(services: Services, project: str, seed: int, *, key: str = "", batches
 
 def make(services: Services, record: JobRecord, *, day: str = DAY, device: str = "cuda:0", seconds: float = 10) -> int:
     made = [
-        make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3)) for task in plan_tasks(record)
+        make_shard(services.store, create_task_message(record, task, attempt=1, max_attempt=3))
+        for task in plan_tasks(record)
     ]
     told = {"created": f"{day}T12:00:00.000000Z", "device": device, "seconds": seconds}
     services.index.write.add_manifests([manifest.model_copy(update=told) for manifest in made])

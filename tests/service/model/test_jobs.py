@@ -22,8 +22,8 @@ from graspd.service.model.planning import (
     MAX_BACKOFF_S,
     OUTCOMES,
     TaskFacts,
+    create_task_message,
     explain_shortfall,
-    message_of,
     plan_tasks,
     sum_outcomes,
 )
@@ -128,7 +128,7 @@ def test_a_job_without_a_scene_keeps_its_id_and_its_record() -> None:
     said = {"request": original_request(wanted), "hand": HAND, "object": OBJECT, "revisions": STAGE_REVISIONS}
     assert job.id == digest_json(said)
     (task,) = plan_tasks(job)
-    assert message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json")["request"] == wanted
+    assert create_task_message(job, task, attempt=1, max_attempt=3).model_dump(mode="json")["request"] == wanted
 
 
 MEMBERS = [DatasetMember(name="h", digest=HAND)], [DatasetMember(name="o", digest=OBJECT)]

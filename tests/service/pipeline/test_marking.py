@@ -21,7 +21,7 @@ from graspd.service.index.rebuild import differences
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import IndexUnavailable
-from graspd.service.model.planning import message_of, plan_tasks
+from graspd.service.model.planning import create_task_message, plan_tasks
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline import controller, job_actions, tagging
 from graspd.service.pipeline.backends import Services
@@ -69,7 +69,7 @@ def submit(seed: int) -> Callable[[Services], object]:
 def make_first_shard(services: Services) -> None:
     record = record_of(services, services.index.jobs.page().items[0].id)
     task = next(plan_tasks(record))
-    make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3))
+    make_shard(services.store, create_task_message(record, task, attempt=1, max_attempt=3))
     done = Event(kind=EventKind.FINISHED, at=timestamp(), task_id=task.id, stage=task.stage, output=task.output)
     services.queue.publish(done)
 

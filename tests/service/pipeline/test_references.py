@@ -13,7 +13,7 @@ from graspd.service.index.rebuild import differences
 from graspd.service.model import names
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, SceneError
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.planning import message_of, plan_tasks
+from graspd.service.model.planning import create_task_message, plan_tasks
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_NETWORKS
@@ -157,7 +157,9 @@ NO_NEIGHBOURS = ({"object": "cup"}, {"object": "../x", "digest": "a" * 32}, {"ob
 def test_a_forged_entry_needs_a_digest(services: Services, named: Reference, forged: dict[str, Any]) -> None:
     named.add(services)
     job = named.submit(services)
-    said = message_of(job, next(plan_tasks(job)), attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
+    said = create_task_message(job, next(plan_tasks(job)), attempt=1, max_attempt=3).model_dump(
+        mode="json", by_alias=True
+    )
     assert TaskMessage.model_validate(said).request == job.request
     with pytest.raises(ValidationError):
         TaskMessage.model_validate({**said, "request": {**said["request"], **forged}})
@@ -245,7 +247,7 @@ def test_a_retried_job_sets_out_from_the_network_it_had(services: Services) -> N
 def test_only_workers_that_know_networks_are_asked_for_one(services: Services) -> None:
     add_network(services)
     jobs = NETWORK.submit(services), NETWORK.submit(services, method="fast_graspd", options={})
-    asked = [message_of(job, next(plan_tasks(job)), attempt=1, max_attempt=3).schema_ for job in jobs]
+    asked = [create_task_message(job, next(plan_tasks(job)), attempt=1, max_attempt=3).schema_ for job in jobs]
     assert asked == [SCHEMA_OF_NETWORKS, OLDEST_TASK_SCHEMA]
 
 

@@ -24,7 +24,7 @@ from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.indexer import Indexer
 from graspd.service.pipeline.lease_reaper import LeaseReaper
-from graspd.service.queue.entries import held_key, queue_name
+from graspd.service.queue.entries import lease_registry_key, queue_name
 from graspd.service.queue.rq_queue import RqQueue, cancel_key, rq_id
 from tests.conftest import PACKAGES, REPOSITORY
 from tests.fakes import request
@@ -63,7 +63,7 @@ def test_a_clock_that_is_ahead_takes_no_task_away(held: tuple[Services, Job], mo
     # RQ's own cleaning up, at that moment by that clock.
     registry.cleanup(timestamp=ahead)
     assert job.get_status() == "failed", "RQ calls it abandoned"
-    assert not registry.connection.exists(held_key(NAME))
+    assert not registry.connection.exists(lease_registry_key(NAME))
 
 
 def test_a_command_that_nobody_hears_is_lost_and_a_key_is_not(held: tuple[Services, Job]) -> None:

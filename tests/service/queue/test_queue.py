@@ -15,7 +15,7 @@ from graspd.service.model.errors import QueueUnavailable
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.connection import connect
-from graspd.service.queue.entries import held_key, list_key, queue_name, queue_names
+from graspd.service.queue.entries import lease_registry_key, list_key, queue_name, queue_names
 from graspd.service.queue.port import BULK_EVERY, Event, EventKind
 from graspd.service.queue.rq_queue import EVENTS, LEAD, RqQueue, lease_state, register_worker, renew_lease, worker_key
 from graspd.worker.process.heartbeat import Heartbeat
@@ -354,9 +354,9 @@ def cost_of_a_sweep(queue: RqQueue) -> int:
 
 
 def test_all_leases_are_read_in_one_round_trip(rq_queue: RqQueue) -> None:
-    rq_queue.connection.zadd(held_key(BULK), {"a-1:x": 1.0})
+    rq_queue.connection.zadd(lease_registry_key(BULK), {"a-1:x": 1.0})
     few = cost_of_a_sweep(rq_queue)
-    rq_queue.connection.zadd(held_key(BULK), {f"{number}-1:x": 1.0 for number in range(500)})
+    rq_queue.connection.zadd(lease_registry_key(BULK), {f"{number}-1:x": 1.0 for number in range(500)})
     assert len(rq_queue.leases()) == 501
     assert cost_of_a_sweep(rq_queue) == few
 

@@ -7,7 +7,7 @@ import pytest
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.pinhole import pixel_rays
-from graspd.service.readers.depth_noise import NOISES, DepthNoise, noise_of, shadow_mask
+from graspd.service.readers.depth_noise import NOISES, DepthNoise, parse_depth_noise, shadow_mask
 
 WIDTH, HEIGHT = 320, 240
 K = np.array([[330.0, 0, 160], [0, 330.0, 120], [0, 0, 1]])
@@ -107,5 +107,5 @@ def test_edges_bleed_and_pixels_on_them_fly_a_little() -> None:
 
 def test_an_unknown_camera_is_told_the_ones_there_are() -> None:
     with pytest.raises(InputError, match="stereo, structured_light, tof"):
-        noise_of("kinect")
-    assert noise_of(None) is None
+        parse_depth_noise("kinect")
+    assert parse_depth_noise(None) is None

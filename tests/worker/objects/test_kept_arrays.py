@@ -27,7 +27,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects import disk_cache, prepare
-from graspd.worker.objects.disk_cache import cached_arrays, cached_step, caching_steps, content_of
+from graspd.worker.objects.disk_cache import cached_arrays, cached_step, caching_steps, content_digest
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object, object_from_path
 from graspd.worker.quality.probe import probe_of
@@ -180,7 +180,7 @@ def test_whatever_differs_in_a_model_changes_its_content(model) -> None:
         assert (changed.content == model.content) == (field.name in ("name", "digest")), field.name
     assert dataclasses.replace(BRICK, vertices=BRICK.vertices.ravel()).content != BRICK.content
     with pytest.raises(TypeError, match="object"):
-        content_of(dataclasses.replace(BRICK, repairs=object()))  # type: ignore[arg-type]
+        content_digest(dataclasses.replace(BRICK, repairs=object()))  # type: ignore[arg-type]
 
 
 def test_no_cache_gives_one_mesh_of_a_file_for_another(own_cache: Path) -> None:

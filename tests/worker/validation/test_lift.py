@@ -130,10 +130,10 @@ def test_a_box_with_its_origin_elsewhere_is_lifted_alike() -> None:
     # Where the object is follows its mesh's origin, which a turn moves more where it is farther from the centre.
     assert test.lift(given, 0).margin == pytest.approx(lift_test().lift(grasp(0.05), 0).margin, abs=0.02)
     # Nobody near: what stands on a table keeps standing for a second. A contact gives by 0.1 mm.
-    test._begin(given, 0)
-    test._put(given.grasp.hand_pose[0] - [0, 0, 1, 0, 0, 0, 0], given.coming[0])
+    test._set_up_scene(given, 0)
+    test._set_posture(given.grasp.hand_pose[0] - [0, 0, 1, 0, 0, 0, 0], given.coming[0])
     test._run_rounds(1.0)
-    moved, turned = test._motion()
+    moved, turned = test._object_motion()
     assert moved < 5e-4 and turned < 1e-3
 
 
@@ -158,7 +158,7 @@ def test_a_neighbour_counts_only_where_the_hand_comes_through_it() -> None:
 def test_neighbour_has_its_own_mass_which_moves_the_key_of_lifts() -> None:
     light, heavy = (beside((0.0, 0.3), (0.05, 0.05, 0.1), mass) for mass in (0.05, 2.0))
     for test, mass in ((light, 0.05), (heavy, 2.0)):
-        test._begin(grasp(0.05), 0)
+        test._set_up_scene(grasp(0.05), 0)
         (free,) = test.scene.neighbours
         assert free.mass == pytest.approx(mass)
         assert np.linalg.norm(test.data.xfrc_applied[free.body]) == pytest.approx(ACCELERATION * mass)
@@ -168,12 +168,12 @@ def test_neighbour_has_its_own_mass_which_moves_the_key_of_lifts() -> None:
 
 def test_a_neighbour_that_leans_or_slides_has_moved() -> None:
     test = beside((0.0, 0.3), (0.05, 0.05, 0.1))
-    test._begin(grasp(0.05), 0)
+    test._set_up_scene(grasp(0.05), 0)
     free = test.scene.neighbours[0]
     turned = np.array([np.cos(np.radians(8)), np.sin(np.radians(8)), 0, 0])
     test.data.qpos[free.qpos + 3 : free.qpos + 7] = quat_multiply(test._beside[0][3:], turned)
     assert test._neighbours_moved()
-    test._begin(grasp(0.05), 0)
+    test._set_up_scene(grasp(0.05), 0)
     about = np.array([np.cos(0.5), 0, 0, np.sin(0.5)])
     test.data.qpos[free.qpos + 3 : free.qpos + 7] = quat_multiply(test._beside[0][3:], about)
     assert not test._neighbours_moved()
@@ -280,7 +280,7 @@ def test_half_the_friction_is_the_hard_lift() -> None:
 
 def test_a_heavier_object_weighs_more_and_takes_more_to_lift() -> None:
     test = VariantLift(models().scene(Variant(mass=2.0)), PLACED, Variant(mass=2.0), None)
-    test._begin(MANY, 0)
+    test._set_up_scene(MANY, 0)
     weight = test.data.xfrc_applied[test.scene.object_body, :3]
     assert weight == pytest.approx(2.0 * test.scene.push_force * np.array([0, 0, 1.0]))
     lifted = [models().lift(MANY, 2, WHERE, Variant(mass=mass)).success for mass in (1.0, 2.0)]

@@ -267,7 +267,7 @@ def test_a_heavier_object_is_pushed_by_its_weight() -> None:
         test._close(grasps, 0)
         test._push(2)
         test._run_rounds(0.1)
-        moved.append(test._offset()[1])
+        moved.append(test._object_displacement()[1])
     # The same acceleration of 10 m/s^2, half a step of velocity added by the implicit step.
     assert moved == pytest.approx([0.5 * 10 * 0.1 * (0.1 + 0.004)] * 2, rel=1e-6)
 
@@ -280,7 +280,7 @@ def test_the_centre_of_mass_moves_and_the_object_stays() -> None:
     assert data.geom("object-0").xpos == pytest.approx(BOX.centre_of_mass, abs=1e-7)
     test = Test(scene)
     scene.place(test.data, FAR, np.zeros(2))
-    assert test._offset() == pytest.approx([0, 0, 0], abs=1e-12), "the mesh's frame is where it was"
+    assert test._object_displacement() == pytest.approx([0, 0, 0], abs=1e-12), "the mesh's frame is where it was"
 
 
 def test_object_or_a_hand_that_is_off_is_met_the_other_way_round() -> None:

@@ -100,12 +100,12 @@ def test_displacement_is_that_of_the_mesh_s_own_frame() -> None:
     scene = build_scene(PADS, far, ConvexPieces((far.hull_vertices,), 1.0, 0.0, "far"), MujocoOptions())
     test = Test(scene)
     scene.place(test.data, FAR, np.zeros(2))
-    assert test._motion() == (pytest.approx(0, abs=1e-12), 0)
+    assert test._object_motion() == (pytest.approx(0, abs=1e-12), 0)
     angle = 0.2
     turned = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
     test.data.qpos[scene.object_qpos + 3 : scene.object_qpos + 7] = turned
     # Turned about its centre the box stays; the mesh's origin, 0.3 m away, does not.
-    assert test._motion() == (pytest.approx(2 * 0.3 * np.sin(angle / 2)), pytest.approx(angle))
+    assert test._object_motion() == (pytest.approx(2 * 0.3 * np.sin(angle / 2)), pytest.approx(angle))
 
 
 def test_the_root_turns_at_an_even_rate_between_two_postures() -> None:
@@ -290,7 +290,7 @@ def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(level: str, tmp_p
     rollout = getattr(test, level)(grasp_of(), 0)
     assert rollout.outcomes[0] is Outcome.DIVERGED and not rollout.success
     # What the guard is for: after MuJoCo's reset the object stands where it began.
-    assert test._motion()[0] < 0.05 and is_invalid(test.data)
+    assert test._object_motion()[0] < 0.05 and is_invalid(test.data)
     test._mark_running(grasp_of(), 0)
     assert not is_invalid(test.data)
     assert list(tmp_path.iterdir()) == [], "MuJoCo's warnings go to no file"
@@ -334,7 +334,7 @@ class Scripted(Test):
         return np.array([MAX_DISPLACEMENT_M * self._moved(self.elapsed), 0.0, 0.0])
 
     def _motion(self) -> tuple[float, float]:
-        return float(np.linalg.norm(self._offset())), MAX_ROTATION * self._rotation(self.elapsed)
+        return float(np.linalg.norm(self._object_displacement())), MAX_ROTATION * self._rotation(self.elapsed)
 
 
 def still(time: float) -> float:

@@ -44,7 +44,7 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = no_files) -> Soup:
         raise MeshError(f"{filename}: meshes of type {suffix or '(none)'} are not read; convert to one of {known}")
     if not data:
         raise MeshError(f"{filename}: the file is empty; export the mesh again")
-    text = _marked_text(data)
+    text = _strip_byte_order_mark(data)
     check_format(filename, text, MeshError)
     try:
         # The check below finds invalid numbers, so NumPy's warnings are not needed.
@@ -60,7 +60,7 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = no_files) -> Soup:
         raise MeshError(f"{filename}: not a readable {kind} file: {what}; export the mesh again") from None
 
 
-def _marked_text(data: bytes) -> bytes:
+def _strip_byte_order_mark(data: bytes) -> bytes:
     """Return text data without its byte order mark, which editors write and formats exclude."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace").encode()

@@ -121,12 +121,14 @@ class _BinaryRows:
     def read(self, element: _Element) -> tuple[dict[str, np.ndarray], _Lists]:
         lists = [p for p in element.properties if p.count_type]
         if not lists:
-            table = self._take(np.dtype([(p.name, self._order + p.type) for p in element.properties]), element.count)
+            table = self._read_values(
+                np.dtype([(p.name, self._order + p.type) for p in element.properties]), element.count
+            )
             return {p.name: table[p.name] for p in element.properties}, {}
-        uniform = self._uniform(element) if len(lists) == 1 else None
+        uniform = self._read_uniform_rows(element) if len(lists) == 1 else None
         return {}, uniform if uniform is not None else self._row_by_row(element)
 
-    def _uniform(self, element: _Element) -> _Lists | None:
+    def _read_uniform_rows(self, element: _Element) -> _Lists | None:
         """Read all rows at once if all lists are as long as the first, as in triangle meshes; else None."""
         first = self._at
         (name,) = self._row_by_row(_Element(element.name, min(element.count, 1), element.properties)).items()
@@ -152,15 +154,15 @@ class _BinaryRows:
         for _ in range(element.count):
             for p in element.properties:
                 if p.count_type:
-                    count = int(self._take(np.dtype(self._order + p.count_type), 1)[0])
+                    count = int(self._read_values(np.dtype(self._order + p.count_type), 1)[0])
                     counts[p.name].append(count)
-                    items[p.name].append(self._take(np.dtype(self._order + p.type), count))
+                    items[p.name].append(self._read_values(np.dtype(self._order + p.type), count))
                 else:
-                    self._take(np.dtype(self._order + p.type), 1)
+                    self._read_values(np.dtype(self._order + p.type), 1)
         empty = [np.zeros(0, np.int64)]
         return {n: (np.array(counts[n], np.int64), np.concatenate(empty + items[n]).astype(np.int64)) for n in counts}
 
-    def _take(self, dtype: np.dtype, count: int) -> np.ndarray:
+    def _read_values(self, dtype: np.dtype, count: int) -> np.ndarray:
         if count < 0 or dtype.itemsize * count > len(self._body) - self._at:
             raise MeshError("truncated: the header states more data than the file has")
         values = np.frombuffer(self._body, dtype, count=count, offset=self._at)

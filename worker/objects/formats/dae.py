@@ -92,16 +92,16 @@ class _Library:
                 if source is None or not 0 < stride <= 64:
                     raise MeshError("a primitive has no vertices; export the mesh again")
                 positions = self.find_element(source.get("source")).find("input[@semantic='POSITION']")
-                points = self._points(positions.get("source") if positions is not None else None)
+                points = self._read_points(positions.get("source") if positions is not None else None)
                 counts, order = _polygons(primitive, kind, stride)
                 corners = order[int(source.get("offset", "0")) :: stride]
                 if int(counts.sum()) != len(corners) or (counts < 0).any():
                     raise MeshError("the stated number of a primitive's corners is wrong; export the mesh again")
                 yield points, triangulate(points, counts, corners), primitive.get("material", "")
 
-    def _points(self, reference: str | None) -> np.ndarray:
+    def _read_points(self, reference: str | None) -> np.ndarray:
         source = self.find_element(reference)
-        values, accessor = _numbers(source.find("float_array")), source.find("technique_common/accessor")
+        values, accessor = _parse_numbers(source.find("float_array")), source.find("technique_common/accessor")
         facts = {} if accessor is None else accessor.attrib
         stride, start = int(facts.get("stride", "3")), int(facts.get("offset", "0"))
         if not 3 <= stride <= 64 or start < 0:
@@ -115,7 +115,7 @@ class _Library:
             self._colours[material] = self._diffuse(material)
         return self._colours[material]
 
-    def _picture(self, effect: Element, sampler: str) -> str:
+    def _texture_file(self, effect: Element, sampler: str) -> str:
         """Return the picture's file of a sampler: the sampler names a surface, and this names an image."""
         name = sampler
         for _ in range(2):
@@ -137,9 +137,9 @@ class _Library:
             effect = self.find_element(instance.get("url") if instance is not None else None)
             found = next(effect.iter("diffuse"), None)
             if found is not None and (texture := found.find("texture")) is not None:
-                picture = colour_of(self._picture(effect, texture.get("texture", "")), self._nearby)
+                picture = colour_of(self._texture_file(effect, texture.get("texture", "")), self._nearby)
                 return unknown if picture is None else picture
-            values = _numbers(found.find("color") if found is not None else None)
+            values = _parse_numbers(found.find("color") if found is not None else None)
         except (MeshError, ValueError):
             return unknown
         return np.clip(values[:3], 0, 1) if len(values) >= 3 and np.isfinite(values[:3]).all() else unknown
@@ -148,16 +148,16 @@ class _Library:
 def _polygons(primitive: Element, kind: str, stride: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the number of corners of each polygon, and the concatenated indices of all corners."""
     if kind == "polygons":
-        parts = [_numbers(part).astype(np.int64) for part in primitive.findall("p")]
+        parts = [_parse_numbers(part).astype(np.int64) for part in primitive.findall("p")]
         counts = np.array([len(part) // stride for part in parts], dtype=np.int64)
         return counts, np.concatenate(parts) if parts else np.zeros(0, np.int64)
-    order = _numbers(primitive.find("p")).astype(np.int64)
+    order = _parse_numbers(primitive.find("p")).astype(np.int64)
     if kind == "polylist":
-        return _numbers(primitive.find("vcount")).astype(np.int64), order
+        return _parse_numbers(primitive.find("vcount")).astype(np.int64), order
     return np.full(len(order) // (3 * stride), 3, dtype=np.int64), order
 
 
-def _numbers(element: Element | None) -> np.ndarray:
+def _parse_numbers(element: Element | None) -> np.ndarray:
     return np.array((element.text or "").split() if element is not None else [], dtype="S40").astype(float)
 
 
@@ -171,7 +171,7 @@ def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarr
     def below(node: Element) -> list[Element]:
         return node.findall("node") + [library.find_element(i.get("url")) for i in node.findall("instance_node")]
 
-    for node, matrix in walk_scene(scene.findall("node") if scene is not None else [], _matrix, below):
+    for node, matrix in walk_scene(scene.findall("node") if scene is not None else [], _node_transform, below):
         if node.find("instance_controller") is not None:
             raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without bones")
         for instance in node.findall("instance_geometry"):
@@ -182,20 +182,20 @@ def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarr
             yield instance.get("url", ""), matrix, bound
 
 
-def _matrix(node: Element) -> np.ndarray:
+def _node_transform(node: Element) -> np.ndarray:
     """Return the product of a node's transforms, in their order."""
     matrix = np.eye(4)
     for element in node:
         step = np.eye(4)
         match element.tag:
             case "matrix":
-                step = _numbers(element).reshape(4, 4)
+                step = _parse_numbers(element).reshape(4, 4)
             case "translate":
-                step[:3, 3] = _numbers(element).reshape(3)
+                step[:3, 3] = _parse_numbers(element).reshape(3)
             case "scale":
-                step[:3, :3] = np.diag(_numbers(element).reshape(3))
+                step[:3, :3] = np.diag(_parse_numbers(element).reshape(3))
             case "rotate":
-                step[:3, :3] = _rotation(*_numbers(element).reshape(4))
+                step[:3, :3] = _rotation(*_parse_numbers(element).reshape(4))
             case _:
                 continue
         matrix = matrix @ step

@@ -38,7 +38,7 @@ def read(data: bytes, nearby: Nearby = no_files) -> Soup:
                 raise MeshError(f"vertex {len(vertices)} has fewer than three coordinates")
         elif line.startswith(b"f "):
             # OBJ counts from 1, backwards from the end for negative indices.
-            face = [_index(part.partition(b"/")[0], len(vertices)) for part in line.split()[1:]]
+            face = [_parse_index(part.partition(b"/")[0], len(vertices)) for part in line.split()[1:]]
             corners += face
             counts.append(len(face))
             if len(counts) % 65536 == 0:
@@ -86,7 +86,7 @@ def _face_colours(shades: list[list[bytes]], faces: np.ndarray) -> np.ndarray | 
     return np.where(np.isfinite(mean), np.clip(np.round(_SHADES * mean) / _SHADES, 0, 1), np.nan)
 
 
-def _index(text: bytes, count: int) -> int:
+def _parse_index(text: bytes, count: int) -> int:
     index = int(text)
     if index == 0 or abs(index) > 2**40:
         raise MeshError(f"a face has the index {index}; OBJ indices count from 1")
@@ -126,7 +126,7 @@ def read_materials(data: bytes, nearby: Nearby) -> dict[bytes, Floats]:
         if key == b"newmtl" and len(found) < MAX_MATERIALS:
             name = rest.strip()
         elif key == b"Kd" and name is not None:
-            colour = _numbers(rest)
+            colour = _parse_colour(rest)
             if colour is not None:
                 found.setdefault(name, colour)
         elif key.lower() == b"map_kd" and name is not None and pictures < MAX_NAMES:
@@ -146,7 +146,7 @@ def colour_of(reference: str, nearby: Nearby) -> Floats | None:
         return None
 
 
-def _numbers(text: bytes) -> Floats | None:
+def _parse_colour(text: bytes) -> Floats | None:
     try:
         values = np.array(text.split()[:3], dtype="S40").astype(float)
     except ValueError:

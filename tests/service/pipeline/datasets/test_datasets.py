@@ -15,7 +15,7 @@ from graspd.service.model import digests, errors, names
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.planning import OUTCOMES
 from graspd.service.model.projects import ProjectScope
-from graspd.service.model.records import DatasetRecord, Snapshot, SnapshotShard, object_set_of, request_of
+from graspd.service.model.records import DatasetRecord, Snapshot, SnapshotShard, create_job_request, create_object_set
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.states import AssetKind, Priority, State
 from graspd.service.pipeline import job_actions
@@ -232,7 +232,7 @@ def test_a_set_has_versions_and_the_newest_counts(either: Services) -> None:
 
 
 def test_a_set_that_broke_off_keeps_its_name_in_its_project(services: Services) -> None:
-    left = object_set_of("round", ["ball"], project="blue")
+    left = create_object_set("round", ["ball"], project="blue")
     put_record(services.store, names.object_set_key("round", left.digest), left)
     with pytest.raises(errors.ConflictError, match="take another name"):
         actions.add_object_set(services, "round", ["ball"], scope=ProjectScope("", everything=False))
@@ -334,7 +334,7 @@ def test_a_cell_without_options_is_the_job_it_always_was(monkeypatch: pytest.Mon
     """The id was computed by graspd 0.1.0 before datasets had options."""
     monkeypatch.setattr(digests, "STAGE_REVISIONS", {"synthesize": 1})
     given = {"name": "x", "hands": ["allegro"], "objects": ["mug"], "grasps": 64, "scenes": 2}
-    request = request_of(DatasetRequest.model_validate(given).cell_options, "allegro", "mug")
+    request = create_job_request(DatasetRequest.model_validate(given).cell_options, "allegro", "mug")
     assert digests.job_id(request, "0" * 32, "1" * 32) == "3451e42bdce0eab4549fc73883b4bbbd"
 
 
