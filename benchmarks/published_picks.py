@@ -97,15 +97,15 @@ class Pick(Lift):
 
     def pick(self, grasps: GraspSet, row: int) -> tuple[str, float]:
         """Return the outcome, and the worst motion over its limit."""
-        if self._begin(grasps, row).outcome is LiftOutcome.PENETRATION:
+        if self._set_up_scene(grasps, row).outcome is LiftOutcome.PENETRATION:
             return "penetration", 2.0
         self._close(grasps, row)
         if self._steps and self._lost():
-            return "lost while closing", self._excess()
+            return "lost while closing", self._motion_excess()
         self._up_slowly(grasps, row) if self.terms.slowly else self._rise(grasps, row)
         self._goal = RISE_M * self._up
         outcome = self._validate(Rollout())
-        return ("lifted" if outcome is Outcome.HELD else outcome.name.lower()), self._excess()
+        return ("lifted" if outcome is Outcome.HELD else outcome.name.lower()), self._motion_excess()
 
     def _up_slowly(self, grasps: GraspSet, row: int) -> None:
         squeezed = grasps.squeeze
@@ -118,7 +118,7 @@ class Pick(Lift):
         self._run(1.5)
 
     def _lost(self) -> bool:
-        moved, turned = self._motion()
+        moved, turned = self._object_motion()
         return bool(is_invalid(self.data) or moved > 2 * FALLEN_M or turned > 2 * TURNED)
 
     def _validate(self, rollout: Rollout) -> Outcome:
@@ -126,9 +126,9 @@ class Pick(Lift):
             return super()._validate(rollout)
         if is_invalid(self.data):
             return Outcome.DIVERGED
-        if abs(float(self._offset() @ self._up)) >= FALLEN_M:
+        if abs(float(self._object_displacement() @ self._up)) >= FALLEN_M:
             return Outcome.DISPLACED
-        return Outcome.ROTATED if self._motion()[1] >= TURNED else Outcome.HELD
+        return Outcome.ROTATED if self._object_motion()[1] >= TURNED else Outcome.HELD
 
 
 def on_table(case: Case) -> PlacedGrasps:
