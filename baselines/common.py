@@ -70,7 +70,7 @@ def frame_along(z: Floats) -> Floats:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object]) -> GraspSet:
+def create_grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object]) -> GraspSet:
     """Return hands as grasps with pregrasp and squeeze; `began` is the planner's start by `time.perf_counter` [s]."""
     hand, obj, device = pair.hand.model, pair.fine.obj.model, pair.hand.device
     seconds = time.perf_counter() - began

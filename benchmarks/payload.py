@@ -62,7 +62,9 @@ class WholeLifts(LiftPayload):
 
     def payload(self, grasps: GraspSet, row: int) -> float:
         self._weigh(self._own)
-        if self._set_up_scene(grasps, row).outcome is not LiftOutcome.NOT_TRIED or not self._close(grasps, row, give_up=True):
+        if self._set_up_scene(grasps, row).outcome is not LiftOutcome.NOT_TRIED or not self._close(
+            grasps, row, give_up=True
+        ):
             return float("nan")
         self._save()
 
@@ -83,7 +85,9 @@ class WholePushes(PushPayload):
 
     def payload(self, grasps: GraspSet, row: int) -> float:
         self._weigh(self._own)
-        if self._set_up_test(grasps, row).outcomes[0] is Outcome.PENETRATION or not self._close(grasps, row, give_up=True):
+        if self._set_up_test(grasps, row).outcomes[0] is Outcome.PENETRATION or not self._close(
+            grasps, row, give_up=True
+        ):
             return float("nan")
         self._save()
 

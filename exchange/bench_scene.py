@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 
 from graspd.exchange.bench_hand import HandMapping
-from graspd.exchange.imported import load_npy, urdf_of, write_mesh, write_obj
+from graspd.exchange.imported import load_npy, urdf_text, write_mesh, write_obj
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
@@ -47,7 +47,7 @@ def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
     for old in meshes.iterdir():
         old.unlink()
     written = [write_obj(meshes / f"convex_piece_{k:03}.obj", *piece) for k, piece in enumerate(pieces)]
-    urdf = urdf_of(name, "object", [f"meshes/{file.name}" for file in written])
+    urdf = urdf_text(name, "object", [f"meshes/{file.name}" for file in written])
     (root / folder / "urdf" / "coacd.urdf").write_text(urdf)
     _, extents = trimesh.bounds.oriented_bounds(obj.hull_vertices)
     facts: Row = {"gravity_center": obj.centre_of_mass.tolist(), "obb": np.asarray(extents, float).tolist()}

@@ -94,7 +94,7 @@ def write_obj(path: Path, vertices: Any, faces: Any, comment: str = "metres") ->
     return path
 
 
-def urdf_of(name: str, link: str, meshes: Sequence[str]) -> str:
+def urdf_text(name: str, link: str, meshes: Sequence[str]) -> str:
     """Return the URDF of one link made of meshes."""
     lines = [f'<robot name="{name}">', f'  <link name="{link}">']
     for mesh in meshes:

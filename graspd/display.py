@@ -40,29 +40,29 @@ def data_frame_of(grasps: Grasps) -> Any:
     columns = grasps.columns
     found: dict[str, Any] = {"object": columns["object"], "valid": grasps.is_valid}
 
-    def add(before: str, pose: str, joints: str) -> None:
+    def add_columns(before: str, pose: str, joints: str) -> None:
         if pose in columns:
             found.update({before + part: columns[pose][:, k] for k, part in enumerate(POSE_PARTS)})
         for k, joint in enumerate(grasps.joint_names if joints in columns else ()):
             # A joint of a gantry may be named x, like a column of the pose.
             found[before + (joint if before + joint not in found else f"joint.{joint}")] = columns[joints][:, k]
 
-    add("", "grasp/hand_pose", "grasp/joint_positions")
+    add_columns("", "grasp/hand_pose", "grasp/joint_positions")
     found |= {name: grasps.metric(name) for name in grasps.metrics}
     for path, data in columns.items():
         name = path.rpartition("/")[2]
         if path.startswith(("grasp/", "quality/")) and data.shape == (len(grasps),) and name not in found:
             found[name] = data
     for before, paths in _MORE.items():
-        add(before, *paths)
+        add_columns(before, *paths)
     return pandas.DataFrame(found)
 
 
-def html_of(grasps: Grasps) -> str:
+def grasps_html(grasps: Grasps) -> str:
     """Return `repr` and a picture of the best grasps as HTML, or a table of their metrics without a picture."""
     head = f"<p>{escape(repr(grasps))}</p>"
     try:
-        png = sheet_of(grasps, PICTURED, EDGE, PICTURE_S)
+        png = sheet_png(grasps, PICTURED, EDGE, PICTURE_S)
     # A notebook must display its grasps even if a file, engine or driver is missing.
     except Exception:
         png = b""
@@ -72,7 +72,7 @@ def html_of(grasps: Grasps) -> str:
     return f'{head}<img alt="the best grasps" style="max-width:100%" src="data:image/png;base64,{data}">'
 
 
-def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
+def start_viewer(grasps: Grasps, *, host: str, port: int) -> Viewer:
     try:
         from graspd.worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
         from graspd.worker.viewing import Viewer, ViewerContent, missing_viewer_text
@@ -85,7 +85,7 @@ def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
     return Viewer(ViewerContent(shard, hand, obj, neighbours_of_shard(shard, [])), host=host, port=port)
 
 
-def sheet_of(grasps: Grasps, count: int, edge: int, limit_s: float = math.inf) -> bytes:
+def sheet_png(grasps: Grasps, count: int, edge: int, limit_s: float = math.inf) -> bytes:
     """Return a PNG of the best grasps, `edge` pixels each; raise TaskCancelled after `limit_s`."""
     from graspd.commands.grasp_sheet import GraspSheet
     from graspd.worker.engines.devices import Device

@@ -95,9 +95,9 @@ class Grasps:
         return f"<{len(self)} grasps of {self.hand} on {names or 'nothing'}, {int(self.is_valid.sum())} valid>"
 
     def _repr_html_(self) -> str:
-        from graspd.display import html_of
+        from graspd.display import grasps_html
 
-        return html_of(self)
+        return grasps_html(self)
 
     def __iter__(self) -> Iterator[Grasp]:
         return (self[i] for i in range(len(self)))
@@ -282,9 +282,9 @@ class Grasps:
         """
         import PIL.Image
 
-        from graspd.display import sheet_of
+        from graspd.display import sheet_png
 
-        return PIL.Image.open(io.BytesIO(sheet_of(self, count, edge)))
+        return PIL.Image.open(io.BytesIO(sheet_png(self, count, edge)))
 
     def view(self, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
         """Serve the grasps in 3D to a browser until `close()` of the result; `url` is its address.
@@ -298,9 +298,9 @@ class Grasps:
                 the address cannot be used.
             NotFoundError: the file of the hand or the object is not found.
         """
-        from graspd.display import viewer_of
+        from graspd.display import start_viewer
 
-        return viewer_of(self, host=host, port=port)
+        return start_viewer(self, host=host, port=port)
 
     def shard(self) -> Shard:
         """Return the grasps as a base shard, with the content that `save` writes.

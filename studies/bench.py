@@ -65,7 +65,7 @@ def bench(
             )
     host = None
     if not wp.get_device(device).is_cuda:
-        host = round(host_ms(hand, nominal, first, min(LARGE, max(batches) * max(joins))), 3)
+        host = round(measure_host_ms(hand, nominal, first, min(LARGE, max(batches) * max(joins))), 3)
     return {
         "device": device_name(device),
         "hand": hand.name,
@@ -189,7 +189,7 @@ def _time_kernels(
     return {name: float(np.median(values)) for name, values in found.items()}, data.state(len(state.pivot))
 
 
-def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
+def measure_host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
     """Return host time per candidate [ms]: time of one CPU thread outside the planner's kernels, with full caches."""
     run = ExecutionContext("cpu", threads=1)
     plan(hand, obj, PlanRequest(count, fidelity, seed=1), run)
@@ -210,7 +210,7 @@ def clock_of(device: str) -> Callable[[], float]:
     return time.process_time if device == "cpu" else time.perf_counter
 
 
-def table(result: dict[str, Any]) -> str:
+def results_table(result: dict[str, Any]) -> str:
     """Return the result of `bench` in Markdown."""
     lines = [
         f"{result['hand']} on {result['object']}, {result['device']}, graspd {result['versions']['graspd']}, "
@@ -246,7 +246,7 @@ def _batch_text(run: dict[str, Any]) -> str:
 def write(result: dict[str, Any], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "bench.json").write_text(json.dumps(result, indent=1) + "\n")
-    (folder / "bench.md").write_text(table(result) + "\n")
+    (folder / "bench.md").write_text(results_table(result) + "\n")
     _plot(result, folder / "bench.png")
 
 

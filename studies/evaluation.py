@@ -226,11 +226,11 @@ def _rounded(value: float) -> float:
     return round(float(value), 6)
 
 
-#: Keys that `combine` summarises by medians over rows.
+#: Keys that `combine_rows` summarises by medians over rows.
 _MEDIANS: Final = (*COLUMNS, "cdc_mm", "sd_cm", "diversity")
 
 
-def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def combine_rows(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Combine rows of several objects: rates over all grasps, osr over objects, medians of their medians."""
     if len(rows) == 1:
         return dict(rows[0])

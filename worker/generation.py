@@ -224,7 +224,7 @@ class Scoring(AbstractContextManager["Scoring"]):
         size, every = len(planned), self.request.want == "candidates"
         in_scene: dict[str, NDArray[np.bool_]] = {}
         with _timed(seconds, "validation"):
-            planned, columns = self._validate(planned, run.part(*PARTS[:2]), known, prefilter)
+            planned, columns = self._validate(planned, run.with_progress_range(*PARTS[:2]), known, prefilter)
         if self.scenes is not None:
             fates[finite[columns["quality/success"] < 0]] = "no_place"
             for name, those in outcome_masks(columns).items():
@@ -236,7 +236,7 @@ class Scoring(AbstractContextManager["Scoring"]):
         columns = {path: array[rows] for path, array in columns.items()}
         with _timed(seconds, "quality"):
             friction = self.request.friction
-            columns |= measure(self.hand, self.obj, grasps, friction=friction, run=run.part(*PARTS[1:]))
+            columns |= measure(self.hand, self.obj, grasps, friction=friction, run=run.with_progress_range(*PARTS[1:]))
         columns["quality/feasible"] = passes_gate(columns)
         feasible = columns["quality/feasible"] == 1
         held = columns.get("quality/success", np.zeros(len(rows), np.int8)) == 1
@@ -425,13 +425,18 @@ class Batch:
 
     def run_round(self, asked: RoundRequest) -> Round:
         known: Known = {}
-        run = self.run.part(*asked.progress)
+        run = self.run.with_progress_range(*asked.progress)
         rollout = self.scoring.rollout(known)  # one for all parts
         parts = split_rows(asked.rows, run.cores if self._is_divisible and run.pool is None else 1)
 
         def planned(part: range, own: ExecutionContext, others: bool) -> Round:
             wanted = self.plan_request(replace(asked, rows=part), rollout, others_have_place=others)
-            hand, obj, request, run = self.scoring.hand, self.scoring.obj, self.request, own.part(0.0, PARTS[0])
+            hand, obj, request, run = (
+                self.scoring.hand,
+                self.scoring.obj,
+                self.request,
+                own.with_progress_range(0.0, PARTS[0]),
+            )
             found = synthesize(hand, obj, wanted, run, method=request.method, options=request.options)
             told = self.grasps_to_store(wanted, found)
             # Verdicts and metrics are many short tasks: they may use all cores, also while other parts run.
@@ -451,7 +456,7 @@ class Batch:
             planned(part, run.without_progress(), True) if isinstance(one, NoStartFound) else one
             for part, one in zip(parts, found, strict=True)
         ]
-        whole = Round.joined(made)
+        whole = Round.concatenate(made)
         whole.seconds = {name: value / len(made) for name, value in whole.seconds.items()}
         return whole
 

@@ -161,7 +161,7 @@ class KeyFile:
             document.keys.append(fresh)
         return token
 
-    def limit(self, name: str, limits: KeyLimits) -> KeyLimits:
+    def set_limits(self, name: str, limits: KeyLimits) -> KeyLimits:
         with self._edit_document() as document:
             for key in (found := _live_keys(document, name)):
                 key.limits = key.limits.model_copy(update=limits.model_dump(exclude_unset=True))

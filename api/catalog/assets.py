@@ -75,7 +75,7 @@ class Assets:
         """
         found = network_report(files, name) if kind is AssetKind.NETWORK else None
         project = project_scope().project
-        digest = self._mark(kind, name, files, "" if shared else project)
+        digest = self._add_project_mark(kind, name, files, "" if shared else project)
         known = self._find(kind, digest)
         if known is None and self._find(kind, digest, EVERYTHING):
             raise ConflictError(f"this {kind.value} is private to another project; upload it without `shared`")
@@ -137,7 +137,7 @@ class Assets:
         deletion.delete_asset(self._services, kind, asset.digest, owner=caller_id(), scope=project_scope())
         log.info("%s %s deleted", kind, asset.name)
 
-    def _mark(self, kind: AssetKind, name: str, files: MutableMapping[str, bytes], project: str) -> str:
+    def _add_project_mark(self, kind: AssetKind, name: str, files: MutableMapping[str, bytes], project: str) -> str:
         """Make the files private to the project by adding its mark; return their digest."""
         files.update(project_mark(files, ""))
         digest = digest_files(kind, files)

@@ -138,7 +138,7 @@ def dataset_grid(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
             value=cell.job_id,
             href=f"/jobs/{cell.job_id}" if cell.planned else "",
             state=cell.state.value,
-            made=cell.counted(dataset.options),
+            made=cell.counted_grasps(dataset.options),
             candidates=cell.candidates,
             share=cell.valid_yield,
             standing=dataset.options.displayed_status,

@@ -38,11 +38,11 @@ router = APIRouter(include_in_schema=False)
 def fields_of(most: int) -> Any:
     """Return a dependency that reads a form of at most `most` fields."""
 
-    async def fields(request: Request) -> AsyncIterator[FormData]:
+    async def parse_fields(request: Request) -> AsyncIterator[FormData]:
         async with request.form(max_fields=most) as found:
             yield found
 
-    return Depends(fields)
+    return Depends(parse_fields)
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def submit_page(request: Request, assets: AssetsOf) -> HTMLResponse:
 
 
 @router.get("/submit/refusals/{kind}/{digest}", dependencies=READ)
-def refused(request: Request, kind: AssetKind, digest: str, assets: AssetsOf) -> HTMLResponse:
+def refusal_page(request: Request, kind: AssetKind, digest: str, assets: AssetsOf) -> HTMLResponse:
     found = refusal_of(assets.get(kind, digest))
     return render(request, "refusal.html", kind=kind.value, problem=found.problem, fixes=found.fixes)
 

@@ -247,11 +247,11 @@ def _logarithmic_scale(values: Sequence[float]) -> tuple[Callable[[float], float
     low, high = (min(values), max(values)) if values else (0.1, 10.0)
     start, end = math.log10(low / 1.6), math.log10(high * 2.4)
 
-    def place(value: float) -> float:
+    def position(value: float) -> float:
         return _LEFT + (math.log10(value) - start) / (end - start) * (WIDTH - _LEFT - _RIGHT)
 
     ticks = [m * 10.0**e for e in range(math.floor(start), math.ceil(end) + 1) for m in (1, 2, 5)]
-    return place, [(place(tick), f"{tick:g}") for tick in ticks if start <= math.log10(tick) <= end]
+    return position, [(position(tick), f"{tick:g}") for tick in ticks if start <= math.log10(tick) <= end]
 
 
 def _linear_scale(
@@ -262,7 +262,7 @@ def _linear_scale(
     size = 10.0 ** math.floor(math.log10(end / 5))
     step = next(size * m for m in (1, 2, 2.5, 5, 10) if size * m >= end / 5 * 0.999)
 
-    def place(value: float) -> float:
+    def position(value: float) -> float:
         return HEIGHT - _BOTTOM - value / end * (HEIGHT - _TOP - _BOTTOM)
 
-    return place, [(place(step * i), f"{step * i:g}") for i in range(int(end / step + 1e-9) + 1)]
+    return position, [(position(step * i), f"{step * i:g}") for i in range(int(end / step + 1e-9) + 1)]

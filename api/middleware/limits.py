@@ -264,9 +264,9 @@ class BodyLimit(HttpMiddleware):
         if (refusal := _body_refusal(scope, limit, is_upload=is_upload)) is not None:
             await _refuse(refusal, scope, receive, send)
         else:
-            await self._watch(scope, receive, send, limit)
+            await self._enforce_limit(scope, receive, send, limit)
 
-    async def _watch(self, scope: Scope, receive: Receive, send: Send, limit: int) -> None:
+    async def _enforce_limit(self, scope: Scope, receive: Receive, send: Send, limit: int) -> None:
         received, began = 0, time.monotonic()
         is_whole = is_answered = False
         refusal: Exception | None = None
@@ -292,14 +292,14 @@ class BodyLimit(HttpMiddleware):
                 return {"type": "http.disconnect"}
             return message
 
-        async def guarded(message: Message) -> None:
+        async def send_once(message: Message) -> None:
             nonlocal is_answered
             if refusal is not None and not is_answered:
                 return
             is_answered = True
             await send(message)
 
-        await self.app(scope, counted, guarded)
+        await self.app(scope, counted, send_once)
         if refusal is not None and not is_answered:
             await _refuse(refusal, scope, receive, send)
 

@@ -69,9 +69,9 @@ class RequestContext(HttpMiddleware):
         request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex[:16]
         scope.setdefault("state", {})["request_id"] = request_id
         with bind_subjects(request=request_id):
-            await self._answer(scope, receive, send, request_id)
+            await self._handle_request(scope, receive, send, request_id)
 
-    async def _answer(self, scope: Scope, receive: Receive, send: Send, request_id: str) -> None:
+    async def _handle_request(self, scope: Scope, receive: Receive, send: Send, request_id: str) -> None:
         started, status = time.perf_counter(), 0
 
         async def with_headers(message: Message) -> None:
@@ -164,7 +164,7 @@ class RootPath(HttpMiddleware):
                 scope["raw_path"] = raw.removeprefix(self.prefix.encode()) or b"/"
         host = Headers(scope=scope).get("host", "")
 
-        async def prefixed(message: Message) -> None:
+        async def add_prefix_to_location(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 if (where := headers.get("location")) is not None:
@@ -175,7 +175,7 @@ class RootPath(HttpMiddleware):
                         headers.append("set-cookie", _COOKIE_PATH.sub(f"; Path={self.prefix}", cookie))
             await send(message)
 
-        await self.app(scope, receive, prefixed)
+        await self.app(scope, receive, add_prefix_to_location)
 
     def _add_prefix(self, where: str, host: str) -> str:
         parts = urlsplit(where)

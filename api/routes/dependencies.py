@@ -73,10 +73,10 @@ def require_metrics_access(request: Request) -> None:
 
 def _service_dependency(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
     # A coroutine, because FastAPI would run a plain function in a thread.
-    async def found(request: Request) -> Any:
+    async def get_service(request: Request) -> Any:
         return getattr(request.app.state, name)
 
-    return found
+    return get_service
 
 
 JobsOf = Annotated[Jobs, Depends(_service_dependency("jobs"))]

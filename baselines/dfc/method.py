@@ -14,7 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.common import frame_along, grasp_set, inner_side_points, load_pair
+from graspd.baselines.common import create_grasp_set, frame_along, inner_side_points, load_pair
 from graspd.baselines.dfc import kernels
 from graspd.service.model.transforms import (
     IDENTITY_POSE,
@@ -68,7 +68,7 @@ class Dfc:
 
         states, energies = zip(*run_parts(split_batch(wanted.count, run), work), strict=True)
         passed = (np.concatenate(energies)[:, :3] < np.array(PASSES)).all(axis=1)
-        return grasp_set(pair, HandState.concatenate(states), began, {"passed": passed.tolist()})
+        return create_grasp_set(pair, HandState.concatenate(states), began, {"passed": passed.tolist()})
 
 
 METHOD: Final = Method(
@@ -148,7 +148,7 @@ class Descent:
             self.rng = wp.array(random, dtype=wp.uint32)
             self._allocate(contacts)
         self.proposal.set_state(starts)
-        for mine, other in zip(self.state, self._proposed(), strict=True):
+        for mine, other in zip(self.state, self._proposal_arrays(), strict=True):
             wp.copy(mine, other)
         self.launches = self._record()
 
@@ -167,14 +167,14 @@ class Descent:
         self.pairs = len(first)
         self.keys = [wp.array(v, dtype=wp.int32) for v in (first, second, body)] + [wp.array(place, dtype=wp.vec3)]
 
-    def _proposed(self) -> list[Any]:
+    def _proposal_arrays(self) -> list[Any]:
         return [self.proposal.pivot, self.proposal.rotation, self.proposal.q]
 
     def _record(self) -> Launches:
         s, m, n, out = self.proposal, self.model, self.n, Launches(self.device)
         pose, own = [s.body_p, s.body_q], [self.new_terms, s.wrench]
         present = [*self.state, self.contact]
-        proposed = [*self._proposed(), self.new_contact]
+        proposed = [*self._proposal_arrays(), self.new_contact]
         given = [len(self.candidates), s.iteration, self.gradient, *present]
         out.add(kernels.propose, n, inputs=given, outputs=[self.rng, self.moment, *proposed, self.new_terms])
         add_poses(out, m, s)
@@ -202,7 +202,7 @@ class Descent:
 
     def hands(self) -> HandState:
         """Return the accepted hands, with joints clipped to their limits."""
-        for mine, other in zip(self._proposed(), self.state, strict=True):
+        for mine, other in zip(self._proposal_arrays(), self.state, strict=True):
             wp.copy(mine, other)
         found = self.proposal.state(self.n)
         hand = self.pair.hand.model

@@ -15,7 +15,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.common import cached_search, collision_free_starts, grasp_set, load_pair
+from graspd.baselines.common import cached_search, collision_free_starts, create_grasp_set, load_pair
 from graspd.baselines.graspd2022 import kernels
 from graspd.service.model.cores import available_cores
 from graspd.service.model.transforms import Floats, quat_rotate
@@ -77,7 +77,7 @@ class Graspd2022:
 
         states, residuals = zip(*run_parts(split_batch(wanted.count, run), work), strict=True)
         info: dict[str, object] = {"residual": np.concatenate(residuals).round(4).tolist()}
-        return grasp_set(pair, HandState.concatenate(states), began, info)
+        return create_grasp_set(pair, HandState.concatenate(states), began, info)
 
 
 METHOD: Final = Method(

@@ -20,7 +20,7 @@ from pydantic import Field
 
 from graspd.baselines.autograsp import kernels as closing_kernels
 from graspd.baselines.autograsp.method import HandCloser
-from graspd.baselines.common import cached_search, frame_along, grasp_set, inner_side_points, load_pair
+from graspd.baselines.common import cached_search, create_grasp_set, frame_along, inner_side_points, load_pair
 from graspd.baselines.graspit import kernels
 from graspd.baselines.graspit.kernels import FIRST_STEP
 from graspd.service.model.errors import InputError
@@ -134,7 +134,7 @@ class Graspit:
             return HandCloser(pair, len(state.pivot)).close(state)
 
         states = HandState.concatenate(run_parts(split_batch(chains, run), work))
-        return grasp_set(pair, states[: wanted.count], began, {"chains": chains, "moves": moves})
+        return create_grasp_set(pair, states[: wanted.count], began, {"chains": chains, "moves": moves})
 
 
 METHOD: Final = Method(

@@ -113,7 +113,7 @@ class NetworkStarts:
     ) -> tuple[HandState, Floats]:
         """Return open hands (n * draws) and their retreat directions (n * draws, 3) by start; object frame."""
         hand, obj, table = model.hand.model, model.obj.model, table_height(placed.supports)
-        seen, draws = SurfaceView.of(obj), max(1, PROPOSALS // each)
+        seen, draws = SurfaceView.from_object(obj), max(1, PROPOSALS // each)
         pivot, rotation, q, away = [], [], [], []
         for number, scene in enumerate(placed.index.tolist()):
             mine = generators[number * each : (number + 1) * each]
@@ -197,7 +197,7 @@ class SurfaceView:
     normals: Floats  # (DENSE, 3) unit outward normals
 
     @classmethod
-    def of(cls, obj: ObjectModel) -> SurfaceView:
+    def from_object(cls, obj: ObjectModel) -> SurfaceView:
         """Sample points uniformly over the surface's area; equal objects have equal points."""
         rng = np.random.default_rng(0)
         corners = obj.vertices[obj.faces]

@@ -158,7 +158,7 @@ class _Layer:
     bias: Floats32
 
     @classmethod
-    def of(cls, network: ProposalNetwork, name: str) -> _Layer:
+    def from_network(cls, network: ProposalNetwork, name: str) -> _Layer:
         weight, bias = network.weights[f"{name}.weight"], network.weights[f"{name}.bias"]
         out, into = weight.shape
         width = max(1, _MULTIPLICATIONS // (_ROWS * into))
@@ -182,7 +182,7 @@ def _layers(network: ProposalNetwork) -> Mapping[str, _Layer]:
     """Return the layers by name, cached in the network."""
     if "layers" not in vars(network):
         names = [name.removesuffix(".bias") for name in network.weights if name.endswith(".bias")]
-        vars(network)["layers"] = {name: _Layer.of(network, name) for name in names}
+        vars(network)["layers"] = {name: _Layer.from_network(network, name) for name in names}
     found: Mapping[str, _Layer] = vars(network)["layers"]
     return found
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from graspd.exchange.imported import urdf_of, write_mesh
+from graspd.exchange.imported import urdf_text, write_mesh
 from graspd.exchange.plan import plain_name
 from graspd.exchange.robots.bundle import Bundle, dump_yaml, rounded_numbers
 from graspd.exchange.robots.execution import RobotTrajectory
@@ -133,5 +133,5 @@ def _write_object(bundle: Bundle, folder: Path) -> list[Path]:
     obj, name = bundle.found.obj, plain_name(bundle.found.obj.name)
     folder.mkdir(parents=True, exist_ok=True)
     urdf, mesh = folder / f"{name}.urdf", folder / f"{name}.obj"
-    urdf.write_text(urdf_of(name, name, [mesh.name]))
+    urdf.write_text(urdf_text(name, name, [mesh.name]))
     return [write_mesh(obj, mesh), urdf]

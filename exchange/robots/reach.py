@@ -146,7 +146,7 @@ class ReachSearch:
         reached = ReachResult()
         for row in range(len(self.found)):
             reached.candidates += 1
-            paths, reason = self.one(row)
+            paths, reason = self.search_row(row)
             if paths is None:
                 reached.refused[reason] += 1
             else:
@@ -156,7 +156,7 @@ class ReachSearch:
                 break
         return reached
 
-    def one(self, row: int) -> tuple[list[Path] | None, str]:
+    def search_row(self, row: int) -> tuple[list[Path] | None, str]:
         """Return the motions of one grasp, or None and the reason of the start that came farthest."""
         long, short = (straight_paths(self.found, row, points) for points in (LONG, SHORT))
         ways = [a if a.phase in _LONG_PHASES else b for a, b in zip(long, short, strict=True)]

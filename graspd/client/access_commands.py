@@ -83,7 +83,7 @@ def limit_key(
     )
     if not given:
         raise InputError("give at least one limit, such as --jobs-per-day 100")
-    limits = _key_file().limit(name, KeyLimits(**given))
+    limits = _key_file().set_limits(name, KeyLimits(**given))
     document = {"name": name, "limits": limits.model_dump(exclude_none=True)}
     print_result(document, f"limits of {name}: {_key_limits(limits)}", json=json)
 

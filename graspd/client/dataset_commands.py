@@ -225,7 +225,7 @@ def list_datasets(
     document = {"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next}
     rows = []
     for one in page.items:
-        made = f"{count(one.counted)} {one.options.displayed_status} of {count(one.asked)}"
+        made = f"{count(one.counted_grasps)} {one.options.displayed_status} of {count(one.asked)}"
         last = (percent(one.progress), made, size(one.size_bytes), minute(one.created))
         rows.append((one.name, one.state, count(one.cells), *last))
     names = ("dataset", "state", "cells", "progress", "grasps", "size", "created")

@@ -218,11 +218,11 @@ class JobDisplay:
             if stage.state is not State.QUEUED:
                 self._started.setdefault(stage.stage, time.monotonic())
             if self._console.is_terminal:
-                self._draw(stage, job)
+                self._update_bar(stage, job)
             else:
                 self._print_state(stage, job)
 
-    def _draw(self, stage: StageStatus, job: Job) -> None:
+    def _update_bar(self, stage: StageStatus, job: Job) -> None:
         if stage.stage not in self._bars:
             made, unit = _stage_items(stage, job)
             self._bars[stage.stage] = self._progress.add_task(
@@ -306,7 +306,7 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
     console.print(f"cells: {states}")
     candidates = f" of {count(dataset.candidates)} candidates ({_yield_text(dataset)})" if dataset.candidates else ""
     console.print(
-        f"grasps: {count(dataset.counted)} {dataset.options.displayed_status}{candidates}, "
+        f"grasps: {count(dataset.counted_grasps)} {dataset.options.displayed_status}{candidates}, "
         f"{count(dataset.asked)} requested; "
         f"{count(dataset.shards)} shards, {size(dataset.size_bytes)}; worker time {duration(dataset.seconds)}",
         soft_wrap=True,
@@ -347,7 +347,7 @@ def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
         bar = progress.add_task(name, total=1.0, rate="", left="")
         said = -1.0
         for dataset in client.watch_dataset(name):
-            pace = metric(dataset.counted / dataset.seconds) if dataset.seconds else None
+            pace = metric(dataset.counted_grasps / dataset.seconds) if dataset.seconds else None
             rate = f"{pace} {dataset.options.displayed_status}/s per worker" if pace is not None else ""
             left = f"{duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
             progress.update(bar, completed=dataset.progress, rate=rate, left=left)
@@ -366,7 +366,7 @@ def _cell_text(cell: CellView, options: JobOptions) -> str:
     if cell.state is State.RUNNING:
         words.append(percent(cell.progress))
     if cell.candidates:
-        made = cell.counted(options)
+        made = cell.counted_grasps(options)
         words.append(f"{count(made)}/{count(cell.asked)} {_yield_text(cell)}")
     if cell.tasks_failed:
         words.append(f"{cell.tasks_failed} failed")

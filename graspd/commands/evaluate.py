@@ -16,7 +16,7 @@ from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
 from graspd.service.model.errors import InputError, choices_text
 from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
 from graspd.service.store.shards import inherited_attributes, json_attribute, read_shard, write_shard
-from graspd.studies.evaluation import Protocol, combine, evaluate
+from graspd.studies.evaluation import Protocol, combine_rows, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.subsets import require_empty_folder
 from graspd.worker.hands.hand_matching import TOLERANCE_M, match_hands
@@ -110,7 +110,7 @@ def _validate_level(protocol: str, level: str) -> str:
 
 
 def _report(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
-    whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])
+    whole = combine_rows([{key: value for key, value in row.items() if key != "file"} for row in rows])
     if json:
         verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
         whole.pop("verdicts", None)

@@ -40,7 +40,13 @@ from graspd.worker.rendering.annotate import parse_channels
 from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, read_cameras
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.scenery import TABLE
-from graspd.worker.rendering.sheets import best_in_scenes, best_rows, best_transferred_rows, views_page, with_palette
+from graspd.worker.rendering.sheets import (
+    best_in_scenes,
+    best_rows,
+    best_transferred_rows,
+    reduce_to_palette,
+    views_page,
+)
 from graspd.worker.rendering.trajectory_pictures import animation_kind
 from graspd.worker.rendering.views import Extras
 from graspd.worker.rendering.views import render as render_views
@@ -162,7 +168,7 @@ def pictures(
         kind: Kind = "trajectory" if trajectory else "three sides" if three else "one side"
         subtitle = f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}"
         page = GraspSheet(base, *models, kind, run, size).png(subtitle=subtitle)
-    write_output(output, with_palette(page) if palette and not animate else page)
+    write_output(output, reduce_to_palette(page) if palette and not animate else page)
     told = {"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()}
     print_result(told, f"{output}: {'' if row else 'the best '}{len(rows)} of {among} {word}", json=json)
 

@@ -48,7 +48,7 @@ def bench(
 ) -> None:
     """Measure grasps per second of the planner, without quality metrics, and the time of each step."""
     from graspd.studies.bench import bench as measure
-    from graspd.studies.bench import table, write
+    from graspd.studies.bench import results_table, write
     from graspd.worker.hands.load import hand_from_path
     from graspd.worker.objects.prepare import object_from_path
 
@@ -66,7 +66,7 @@ def bench(
     )
     if out is not None:
         write(result, out)
-    print_result(result, table(result), json=json)
+    print_result(result, results_table(result), json=json)
 
 
 def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[float] | None) -> list[Fidelity]:
@@ -197,7 +197,7 @@ def chart(
     from graspd.studies.chart.chart import settings_of
     from graspd.studies.chart.report import write
     from graspd.studies.chart.sweeps import knob_values
-    from graspd.studies.chart.sweeps import sweep as turn
+    from graspd.studies.chart.sweeps import sweep_settings as turn
     from graspd.worker.hands.load import hand_from_path
 
     if source is not None:
@@ -218,18 +218,20 @@ def chart(
     models, things = [hand_from_path(part) for part in _parts(hands)], _chart_objects(_parts(objects))
     said = {"command": shlex.join(["graspd", *(_without_folders(word) for word in sys.argv[1:])]), "remark": remark}
 
-    def keep(so_far: dict[str, Any]) -> None:
+    def save_partial(so_far: dict[str, Any]) -> None:
         if out is not None:
             write(so_far | said, out)
 
     if place is None:
-        from graspd.studies.chart.chart import chart as run
+        from graspd.studies.chart.chart import measure_chart as run
 
-        result = run(models, things, chosen, repeats=repeats, models=models_around, say=_echo, keep=keep)
+        result = run(models, things, chosen, repeats=repeats, models=models_around, say=_echo, keep=save_partial)
     else:
         from graspd.studies.chart.scenes import scene_chart
 
-        result = scene_chart(models, things, chosen, place, models=models_around, work=work, say=_echo, keep=keep)
+        result = scene_chart(
+            models, things, chosen, place, models=models_around, work=work, say=_echo, keep=save_partial
+        )
     result |= said
     if sweep:
         result["sweeps"] = turn(
@@ -274,12 +276,12 @@ def _chart_scene(scene: str) -> SceneSpec | None:
 def _without_folders(word: str) -> str:
     """Remove local folders from a word of the command line, because they differ between machines."""
 
-    def one(part: str) -> str:
+    def shorten_path(part: str) -> str:
         if "/data/" in part:
             return "DATA/" + part.split("/data/", 1)[1]
         return Path(part).name if part.startswith("/") else part
 
-    return ",".join(one(part) for part in word.split(","))
+    return ",".join(shorten_path(part) for part in word.split(","))
 
 
 def _parts(text: str) -> list[str]:

@@ -241,7 +241,7 @@ def connect_postgres(url: str | URL) -> Engine:
 
     # Runs before SQLAlchemy inspects the connection: the inspection fails on SQL_ASCII databases, which return bytes.
     @event.listens_for(engine, "connect", insert=True)
-    def _is_utf8(connection: Any, _record: Any) -> None:
+    def _require_utf8(connection: Any, _record: Any) -> None:
         info = getattr(connection, "info", None)
         if info is not None and (encoding := info.parameter_status("server_encoding")) != "UTF8":
             raise InputError(
@@ -256,7 +256,7 @@ def _sqlite_engine(url: str | URL) -> Engine:
     engine = create_engine(url, connect_args={"timeout": _BUSY_TIMEOUT_S})
 
     @event.listens_for(engine, "connect")
-    def _pragmas(connection: Any, _record: Any) -> None:
+    def _set_pragmas(connection: Any, _record: Any) -> None:
         connection.isolation_level = None  # Only `write_transaction` begins transactions.
         for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", "temp_store=MEMORY"):
             connection.execute(f"PRAGMA {pragma}")

@@ -323,13 +323,13 @@ class DatasetView(Validated):
     def reason(self) -> str | None:
         if not self.state.is_final or self.options.want != "valid":
             return None
-        options, found = self.options, self.counted
+        options, found = self.options, self.counted_grasps
         return explain_shortfall(
             found, self.asked, options.counted_status, self.candidates, options.budget, self.outcomes
         )
 
     @property
-    def counted(self) -> int:
+    def counted_grasps(self) -> int:
         """Number of grasps that count: valid ones, or all stored ones if validation is off."""
         return self.valid if self.options.displayed_status == "valid" else self.grasps
 
@@ -354,7 +354,7 @@ class CellView(Validated):
     seconds: float = Field(description="total worker time [s]")
     reason: str | None = Field(description="why it failed, or found fewer grasps than requested")
 
-    def counted(self, options: JobOptions) -> int:
+    def counted_grasps(self, options: JobOptions) -> int:
         """Number of grasps that count: valid ones, or all stored ones if validation is off."""
         return self.valid if options.displayed_status == "valid" else self.grasps
 
@@ -371,7 +371,7 @@ class SnapshotView(View):
     valid: int
     size_bytes: int
 
-    def counted(self, options: JobOptions) -> int:
+    def counted_grasps(self, options: JobOptions) -> int:
         """Number of grasps that count: valid ones, or all stored ones if validation is off."""
         return self.valid if options.displayed_status == "valid" else self.grasps
 

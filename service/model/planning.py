@@ -88,7 +88,7 @@ def plan_tasks(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedT
 
 def create_task_message(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
     return TaskMessage(
-        schema_=max(needed_schema(job.request), SCHEMA_OF_RANGES if count_batches(task.count) > 1 else 0),
+        schema_=max(required_schema(job.request), SCHEMA_OF_RANGES if count_batches(task.count) > 1 else 0),
         newest_schema=TASK_SCHEMA,
         task_id=task.id,
         job_id=job.id,
@@ -111,7 +111,7 @@ def create_task_message(job: JobRecord, task: PlannedTask, *, attempt: int, max_
 _SCHEMAS: Final = {row.name: row.option.schema for row in option_rows(JobOptions, "job") if row.option.schema}
 
 
-def needed_schema(request: JobRequest, since: Mapping[str, int] = _SCHEMAS) -> int:
+def required_schema(request: JobRequest, since: Mapping[str, int] = _SCHEMAS) -> int:
     """Return the oldest schema that can express a request: the schema of its newest option with a value."""
     fields = JobRequest.model_fields
     used = [schema for name, schema in since.items() if getattr(request, name) != fields[name].get_default()]

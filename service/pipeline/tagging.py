@@ -27,7 +27,7 @@ def tag_grasps(
 ) -> int:
     """Add a tag to grasps; return how many did not have it. LimitError: more than `MOST_TAGGED` in all."""
 
-    def added(tag: Tag) -> Tag:
+    def add_grasps(tag: Tag) -> Tag:
         members = tag.members | set(grasps)
         if len(members) > MOST_TAGGED:
             raise LimitError(f"the tag {name!r} would name {len(members)} grasps; a tag names at most {MOST_TAGGED}")
@@ -35,24 +35,24 @@ def tag_grasps(
 
     now = timestamp()
     fresh = Tag(id=tag_id(name, project), name=name, number=1, created=now, changed=now, owner=owner, project=project)
-    before, after = _change_tag(services, fresh.id, added, permit, fresh=fresh)
+    before, after = _change_tag(services, fresh.id, add_grasps, permit, fresh=fresh)
     return len(after.members) - len(before.members)
 
 
 def untag_grasps(services: Services, tag: str, grasps: Collection[Grasp], *, permit: Permit) -> int:
     """Remove a tag, by its id, from grasps; return how many had it."""
 
-    def without(one: Tag) -> Tag:
+    def remove_grasps(one: Tag) -> Tag:
         return one.model_copy(update={"grasps": rows_by_shard(one.members - set(grasps))})
 
-    before, after = _change_tag(services, tag, without, permit)
+    before, after = _change_tag(services, tag, remove_grasps, permit)
     return len(before.members) - len(after.members)
 
 
 def delete_tag(services: Services, tag: str, *, permit: Permit, owner: str = "") -> None:
     """Delete a tag by its id; its list of grasps is stored for the grace time."""
 
-    def gone(one: Tag) -> Tag:
+    def mark_deleted(one: Tag) -> Tag:
         said = {"name": one.name, "submitter": one.owner, "project": one.project}
         deletion = Deletion(what="tag", id=one.id, at=timestamp(), owner=owner, **said)
         folder = removed_folder(deletion)
@@ -60,7 +60,7 @@ def delete_tag(services: Services, tag: str, *, permit: Permit, owner: str = "")
         put_record(services.store, f"{folder}/deletion.json", deletion)
         return one.model_copy(update={"grasps": {}, "gone": True})
 
-    _change_tag(services, tag, gone, permit)
+    _change_tag(services, tag, mark_deleted, permit)
 
 
 def restore_tag(services: Services, tag: Tag) -> None:

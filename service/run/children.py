@@ -71,7 +71,7 @@ class Child:
         self.starts += 1
         self._started = time.monotonic()
 
-    def watch(self) -> None:
+    def restart_if_ended(self) -> None:
         """Restart the process if it has ended, after a pause that doubles with each further failure."""
         now = time.monotonic()
         if self.process is not None:
@@ -119,7 +119,7 @@ def keep_alive(children: Sequence[Child], stop: threading.Event) -> None:
         child.start()
     while not stop.wait(_WATCH_S):
         for child in children:
-            child.watch()
+            child.restart_if_ended()
 
 
 def stop_children(children: Sequence[Child], grace_s: float) -> None:

@@ -75,11 +75,11 @@ def _wrist_column(rows: str) -> Column:
 
 
 def _metric_columns(*, optional: bool) -> dict[str, Column]:
-    def column(metric: GraspMetric) -> Column:
+    def metric_column(metric: GraspMetric) -> Column:
         shape, dtype = "N T" if metric.swept else "N", "i4" if metric.whole else "f8"
         return Column(shape, dtype, metric.units, "none", metric.meaning, optional)
 
-    return {metric.path: column(metric) for metric in GRASP_METRICS if metric.optional == optional}
+    return {metric.path: metric_column(metric) for metric in GRASP_METRICS if metric.optional == optional}
 
 
 SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {

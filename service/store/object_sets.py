@@ -47,7 +47,7 @@ def group_objects(files: Mapping[str, bytes]) -> Objects:
     for owner, names in owners.items():
         # EGAD: each mesh of one folder is an object. YCB: each object has a folder with variants of its mesh.
         is_object = len(owner) > len(top) and _are_variants(names)
-        for name in [min(names, key=_rank)] if is_object else names:
+        for name in [min(names, key=_preference_key)] if is_object else names:
             parts = owner[len(top) :] if is_object else (*owner[len(top) :], PurePosixPath(name).stem)
             chosen[_unique_name("_".join(parts), chosen)] = name
     return {name: _object_files(files, mesh) for name, mesh in sorted(chosen.items())}
@@ -90,7 +90,7 @@ def _are_variants(names: list[str]) -> bool:
     return len(stems) == 1 or any(stem in PREFERRED for stem in stems)
 
 
-def _rank(name: str) -> tuple[int, str]:
+def _preference_key(name: str) -> tuple[int, str]:
     stem = PurePosixPath(name).stem.lower()
     return (PREFERRED.index(stem) if stem in PREFERRED else len(PREFERRED), name)
 

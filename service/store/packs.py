@@ -59,12 +59,12 @@ def convert_packs(store: Store) -> Iterator[ShardManifest]:
     packs = [key for key in keys if key.endswith(".pack")]
     for pack in packs:
         dead = pack.removesuffix(".pack") + ".dead/"
-        yield from _unpack(store, pack, [key for key in keys if key.startswith(dead)])
+        yield from _convert_pack(store, pack, [key for key in keys if key.startswith(dead)])
     for key in set(keys) - set(packs):
         store.delete(key)
 
 
-def _unpack(store: Store, key: str, dead: list[str]) -> Iterator[ShardManifest]:
+def _convert_pack(store: Store, key: str, dead: list[str]) -> Iterator[ShardManifest]:
     try:
         data = store.get(key)
         gone = {shard for record in dead for shard in json.loads(store.get(record))["shards"]}

@@ -45,12 +45,12 @@ def write_card(
     except OSError as error:
         raise InputError(f"the folder {folder} cannot be created: {error.strerror}") from None
 
-    def counted() -> Iterator[ShardContents]:
+    def report_progress() -> Iterator[ShardContents]:
         for number, piece in enumerate(read_shards(contents), start=1):
             yield piece
             progress(number, len(contents.shards))
 
-    tally = tally_of(contents, counted())
+    tally = tally_of(contents, report_progress())
     card = card_content(contents, tally, licence=licence, source=source)
     plots = draw(card, tally, folder)
     if write_samples(contents.shards, folder / SHEET):

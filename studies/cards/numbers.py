@@ -32,7 +32,7 @@ _KINDS: Final = ("base", "scene", "views")
 
 def card_content(contents: Contents, tally: Tally, *, licence: str = "", source: str = "") -> Row:
     """Return the whole content of a card as JSON values."""
-    whole = CellTally.of(tally.cells.values())
+    whole = CellTally.merge(tally.cells.values())
     taken = contents.snapshot
     return {
         "schema": "graspd/card@1",

@@ -35,7 +35,7 @@ class JointUse:
     counts: NDArray[np.int64]  # (J, BINS) counts of grasps
 
     @classmethod
-    def of(cls, names: tuple[str, ...], facts: Mapping[str, Any]) -> JointUse:
+    def from_hand_facts(cls, names: tuple[str, ...], facts: Mapping[str, Any]) -> JointUse:
         """Return empty histograms for the joints with limits in the hand's facts."""
         lower, upper = dict(facts.get("lower", {})), dict(facts.get("upper", {}))
         known = tuple(name for name in names if name in lower and upper[name] > lower[name])
@@ -92,7 +92,7 @@ class CellTally:
     sample: list[Posture] = field(default_factory=list)
 
     @classmethod
-    def of(cls, cells: Iterable[CellTally]) -> CellTally:
+    def merge(cls, cells: Iterable[CellTally]) -> CellTally:
         """Return the sums of several cells, without `prints` and `sample`."""
         out = cls()
         for cell in cells:
@@ -140,10 +140,10 @@ class Tally:
     threshold_m: Counter[float] = field(default_factory=Counter)
 
     def of_hand(self, hand: str) -> CellTally:
-        return CellTally.of(cell for (name, _), cell in self.cells.items() if name == hand)
+        return CellTally.merge(cell for (name, _), cell in self.cells.items() if name == hand)
 
     def of_object(self, obj: str) -> CellTally:
-        return CellTally.of(cell for (_, name), cell in self.cells.items() if name == obj)
+        return CellTally.merge(cell for (_, name), cell in self.cells.items() if name == obj)
 
 
 _ATTRIBUTES: Final = (
@@ -232,7 +232,7 @@ def _add_postures(tally: Tally, cell: CellTally, piece: ShardContents, hand: Ass
     if held < SAMPLED and len(pose):
         cell.sample.append(Posture(pose[: SAMPLED - held], joints[: SAMPLED - held]))
     if names := piece.said.get("joint_names"):
-        use = tally.joints.setdefault(piece.file.hand, JointUse.of(tuple(names), hand.facts))
+        use = tally.joints.setdefault(piece.file.hand, JointUse.from_hand_facts(tuple(names), hand.facts))
         use.add(tuple(names), joints)
 
 

@@ -37,7 +37,7 @@ class ChartObject:
     load: Callable[[float], ObjectModel]
 
 
-def chart(
+def measure_chart(
     hands: Sequence[HandModel],
     things: Sequence[ChartObject],
     settings: Sequence[Setting],
@@ -64,8 +64,8 @@ def chart(
                     cell.time_first(cell.setting.run.cores)
             for cell in cells:
                 cell.validate_strictly(models)
-                runs.append(_row(cell, hand, thing))
-                say(_line(runs[-1]))
+                runs.append(_combination_row(cell, hand, thing))
+                say(_progress_line(runs[-1]))
             keep(_result(runs, settings, models))
     return _result(runs, settings, models)
 
@@ -87,14 +87,14 @@ def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting], models:
     }
 
 
-def _row(cell: SettingRuns, hand: HandModel, thing: ChartObject) -> dict[str, Any]:
+def _combination_row(cell: SettingRuns, hand: HandModel, thing: ChartObject) -> dict[str, Any]:
     setting = cell.setting
     names = {"method": setting.method, "fidelity": setting.fidelity, "hand": hand.name, "object": thing.name}
     best = {key: rounded_json_value(value) for key, value in cell.best().items()}
     return {**names, "options": dict(setting.options), **run_figures(cell), "best": best}
 
 
-def _line(run: dict[str, Any]) -> str:
+def _progress_line(run: dict[str, Any]) -> str:
     return (
         f"{run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
         f"{run['end_to_end_per_second']:8.3f} valid/s  dexgraspbench {run['dexgraspbench']:.2f}  hard "

@@ -95,7 +95,7 @@ def scene_chart(
         for hand in hands:
             for setting, way in _planning_modes(settings):
                 runs.append(_cached_result(setting, way, hand, place, models, work))
-                say(_line(runs[-1]))
+                say(_progress_line(runs[-1]))
             keep(_result(runs, settings, spec, models))
     return _result(runs, settings, spec, models)
 
@@ -270,7 +270,7 @@ def _result(runs: Sequence[Row], settings: Sequence[Setting], spec: SceneSpec, m
     }
 
 
-def _line(run: Row) -> str:
+def _progress_line(run: Row) -> str:
     return (
         f"{run['way']:14s} {run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
         f"{run['end_to_end_per_second']:8.3f} lifted/s  clear {run['clear']:.2f}  lift {run['lift']:.2f}  "

@@ -87,7 +87,7 @@ def knob_values(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValu
     return [*found[:2], *(turn for turn in found if turn.knob == "queries")] if quick else found
 
 
-def sweep(
+def sweep_settings(
     hand: HandModel,
     thing: ChartObject,
     *,

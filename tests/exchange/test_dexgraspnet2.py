@@ -319,12 +319,12 @@ def test_pixels_of_the_object_take_what_is_nearest() -> None:
     surface = np.array([[-0.005, -0.0025, 0.0], [0.0, -0.0025, 0.0]])
     scene = SceneGraspness(surface, np.array([0]), np.array([1.0, 0.25]))
     ahead = np.array([0, 0, 0.5, 1, 0, 0, 0])
-    values = scene.of_view(depth, labels, K, np.eye(4), ahead)
+    values = scene.picture_graspness(depth, labels, K, np.eye(4), ahead)
     # Row by row: two of the object, its neighbour, table; the object again, a hole, which is no point, and table.
     assert values.shape == (7, 1)
     np.testing.assert_allclose(values[:, 0], [1, 0.25, 0, 0, 1, 0, 0])
     # An object that stands 13 cm from where the picture shows it is out of reach.
-    assert not scene.of_view(depth, labels, K, np.eye(4), ahead + np.array([0, 0, 0.13, 0, 0, 0, 0])).any()
+    assert not scene.picture_graspness(depth, labels, K, np.eye(4), ahead + np.array([0, 0, 0.13, 0, 0, 0, 0])).any()
 
 
 def test_a_hand_looks_between_its_thumb_and_its_fingers(hand, grasps: GraspSet) -> None:

@@ -18,7 +18,7 @@ from graspd.baselines.learned.network import save
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.store.shards import write_shard
-from graspd.studies.bench import clock_of, host_ms, kernel_shares
+from graspd.studies.bench import clock_of, kernel_shares, measure_host_ms
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.generation import validated_grasps
 from graspd.worker.grasps import Posture
@@ -58,7 +58,7 @@ def test_every_run_has_the_keys_of_the_contract_and_adds_up(tmp_path) -> None:
 
 def test_kernels_are_no_time_of_the_host_and_their_shares_add_up() -> None:
     hand, obj, fidelity, count = hand_from_path("barrett"), object_from_path("block"), FIDELITIES["draft"], 16
-    host = host_ms(hand, obj, fidelity, count)
+    host = measure_host_ms(hand, obj, fidelity, count)
     began = time.thread_time()
     plan(hand, obj, PlanRequest(count, fidelity, seed=0), ExecutionContext("cpu", threads=1))
     assert host < 0.5 * 1e3 * (time.thread_time() - began) / count

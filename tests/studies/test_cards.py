@@ -453,7 +453,7 @@ def test_cells_of_sphere_are_equal_and_one_direction_is_one_cell() -> None:
 
 
 def test_the_use_of_a_joint_is_a_share_of_its_limits() -> None:
-    use = JointUse.of(("a", "b"), {"lower": {"a": -1.0}, "upper": {"a": 1.0}})
+    use = JointUse.from_hand_facts(("a", "b"), {"lower": {"a": -1.0}, "upper": {"a": 1.0}})
     use.add(("a", "b"), np.stack([np.linspace(-0.5, 0.5, 1001), np.zeros(1001)], axis=1))
     (found,) = use.shares().values()
     # bins are 1/200 of the range

@@ -219,7 +219,7 @@ def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, monkeypat
 def test_a_part_of_a_part_fills_its_share_of_the_whole() -> None:
     told: list[tuple[float, float, str]] = []
     run = ExecutionContext("cuda:7", 3, lambda *what: told.append(what), lambda: True)
-    part = run.part(0.5, 1.0).part(0.0, 0.5)
+    part = run.with_progress_range(0.5, 1.0).with_progress_range(0.0, 0.5)
     part.progress(1, 2, "half")
     part.progress(5, 5, "whole")
     part.progress(0, 0, "of nothing")

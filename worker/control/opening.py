@@ -148,7 +148,7 @@ class Openings:
 
     def _open_directions(self, grasp: Posture, sweep: Any) -> None:
         posing, hand = self.posing, self.posing.hand
-        bodies, near = posing.touch(grasp, CLEARANCE_M)
+        bodies, near = posing.nearest_points(grasp, CLEARANCE_M)
         with wp.ScopedDevice(posing.device):
             wrench = [wp.empty((self.count, hand.bodies), dtype=wp.vec3d) for _ in range(2)]
             away = wp.empty((self.count, hand.dofs), dtype=wp.float64)

@@ -43,7 +43,7 @@ def balance_forces(
     Normal forces sum to `total` [N]. If a torque exceeds its limit, all forces are scaled down together, which keeps
     the balance. Points press within the first distance of `reach` [m]; on a finger without such points, within the
     second distance. At most `most` of these points are used, far apart from each other."""
-    bodies, near = posing.touch(grasp, max(reach))
+    bodies, near = posing.nearest_points(grasp, max(reach))
     count, points, radius = len(grasp), len(posing.probe.points), posing.probe.obj.radius
     rows = int(touching.FIRST_TORQUE) + posing.hand.dofs
     with wp.ScopedDevice(posing.device):

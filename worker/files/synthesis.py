@@ -73,7 +73,7 @@ class SynthesisResult:
         request, count = self.request, len(self.arrays["quality/valid"])
         if self.interrupted:
             return f"interrupted: {count} of {request.grasps} grasps were finished"
-        limit, narrow = self.limit, self.narrow
+        limit, narrow = self.payload_limit, self.narrow_reason
         reason = explain_shortfall(
             count,
             request.grasps,
@@ -88,12 +88,12 @@ class SynthesisResult:
         return f"{reason}; {narrow}" if reason and narrow else reason
 
     @property
-    def narrow(self) -> str | None:
+    def narrow_reason(self) -> str | None:
         """Return the geometric reason why no grasp is valid; None if it is unknown or a grasp is valid."""
         return None if self.arrays["quality/valid"].any() else self.batches[0].narrow
 
     @property
-    def limit(self) -> PayloadLimit | None:
+    def payload_limit(self) -> PayloadLimit | None:
         """Return the payload limit if it explains why no grasp was found."""
         return None if len(self.arrays["quality/valid"]) else self.batches[0].limit
 
@@ -122,8 +122,8 @@ class SynthesisResult:
         if request.shake:
             margin = self._finite_values("shake_margin")
             summary["shake_share"] = round(float((margin < 1).mean()), 4) if len(margin) else None
-        if self.limit is not None:
-            summary["limit"] = self.limit.facts()
+        if self.payload_limit is not None:
+            summary["limit"] = self.payload_limit.facts()
         summary |= self._diversity()
         if request.model_count:
             summary |= {
@@ -134,7 +134,7 @@ class SynthesisResult:
             }
         if self.place.kind != "free":
             summary |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
-            summary |= {"rolling_scenes": self.rolling, "narrow": self.narrow}
+            summary |= {"rolling_scenes": self.rolling, "narrow": self.narrow_reason}
         return summary
 
     def _diversity(self) -> dict[str, Any]:

@@ -124,7 +124,7 @@ class HandModel:
 
     @cached_property
     def features(self) -> HandFeatures:
-        return HandFeatures.of(self.pieces)
+        return HandFeatures.from_pieces(self.pieces)
 
     @property
     def bodies(self) -> int:

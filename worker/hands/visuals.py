@@ -81,7 +81,7 @@ class Visuals:
         soups: dict[str, Soup] = {}
         left = MAX_FACES
         for item in self.placed:
-            for mesh in _meshes(item, self.files, self.base, soups):
+            for mesh in _visual_meshes(item, self.files, self.base, soups):
                 left -= len(mesh.faces)
                 if left >= 0:
                     found.append(mesh)
@@ -109,7 +109,9 @@ def merge_and_thin(vertices: Floats, faces: Ints, share: Callable[[int], float])
     return np.asarray(points, float), np.asarray(triangles, np.int32)
 
 
-def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dict[str, Soup]) -> list[VisualMesh]:
+def _visual_meshes(
+    item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dict[str, Soup]
+) -> list[VisualMesh]:
     shape = item.shape
     if shape.kind != "mesh":
         vertices, faces = tessellate(shape.kind, shape.size)

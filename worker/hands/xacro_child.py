@@ -67,7 +67,7 @@ def _expand(given: dict[str, Any]) -> str:
 
     texts: dict[str, str] = given["texts"]
 
-    def named(path: str) -> str:
+    def resolve_file(path: str) -> str:
         inside = posixpath.normpath(posixpath.join(_TOP, path.replace("\\", "/")))
         if not inside.startswith(_TOP + "/"):
             name = path.removeprefix(_TOP + "/")
@@ -75,7 +75,7 @@ def _expand(given: dict[str, Any]) -> str:
         return inside.removeprefix(_TOP + "/")
 
     def text_of(path: str) -> str:
-        name = named(path)
+        name = resolve_file(path)
         name = name if name in texts else match_name(name, texts) or name
         if name in texts and texts[name].startswith("version https://git-lfs."):
             raise Refused(f"includes {name!r}, which is a Git LFS pointer, not the file itself: git lfs pull")
@@ -108,7 +108,7 @@ def _expand(given: dict[str, Any]) -> str:
 
     xacro.parse, xacro.safe_eval = parse, evaluate
     xacro.open = lambda path, *_: io.StringIO(text_of(path))
-    pattern_of = lambda pattern: [f"{_TOP}/{n}" for n in fnmatch.filter(texts, named(pattern))]  # noqa: E731
+    pattern_of = lambda pattern: [f"{_TOP}/{n}" for n in fnmatch.filter(texts, resolve_file(pattern))]  # noqa: E731
     xacro.glob = SimpleNamespace(glob=pattern_of)
     substitution_args._eval, substitution_args._eval_find = substitute, find
     substitution_args._eval_env = substitution_args._eval_dict["env"] = environment
@@ -172,10 +172,10 @@ def _restrict_process(cpu_s: int, memory_bytes: int) -> None:
     limits = {"AS": memory_bytes, "CORE": 0, "FSIZE": 0, "NOFILE": 3}
     for what, value in limits.items():
         resource.setrlimit(getattr(resource, f"RLIMIT_{what}"), (value, value))
-    sys.addaudithook(_refuse)
+    sys.addaudithook(_refuse_event)
 
 
-def _refuse(event: str, _arguments: tuple[Any, ...]) -> None:
+def _refuse_event(event: str, _arguments: tuple[Any, ...]) -> None:
     if event not in _HARMLESS:
         raise Refused(f"it reaches out of its folder ({event}); expand it yourself and give the URDF")
 

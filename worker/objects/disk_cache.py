@@ -84,7 +84,7 @@ def cached_step(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Seq
 
 
 def _cache_file(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Path:
-    address = digest_json([*terms, revision(tuple(str(module.__file__) for module in code), _LIBRARIES)])
+    address = digest_json([*terms, code_revision(tuple(str(module.__file__) for module in code), _LIBRARIES)])
     return user_cache.cache_folder(kind) / f"{address}.npz"
 
 
@@ -105,7 +105,7 @@ def _write(file: Path, arrays: Arrays) -> None:
 
 
 @lru_cache(maxsize=16)
-def revision(files: tuple[str, ...], libraries: tuple[str, ...]) -> str:
+def code_revision(files: tuple[str, ...], libraries: tuple[str, ...]) -> str:
     """Compute a digest of source files, libraries, and the processor type, which may affect the last bits."""
     whole = hashlib.sha256(b"".join(Path(file).read_bytes() for file in files))
     return digest_json([whole.hexdigest(), *map(version_of, libraries), platform.machine()])

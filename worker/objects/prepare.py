@@ -170,7 +170,7 @@ def object_name(path: Path) -> str:
 @lru_cache(maxsize=1)
 def revision() -> str:
     """Compute a digest of this package and its libraries, so that a change invalidates cached objects."""
-    return disk_cache.revision(tuple(map(str, sorted(Path(__file__).parent.rglob("*.py")))), _LIBRARIES)
+    return disk_cache.code_revision(tuple(map(str, sorted(Path(__file__).parent.rglob("*.py")))), _LIBRARIES)
 
 
 Mesh = tuple[Floats, Indices]

@@ -55,7 +55,7 @@ class PostureData:
             position = wp.array(hand_pose[:, :3] - self.probe.obj.centre_of_mass, dtype=wp.vec3d)
             return position, wp.array(to_xyzw(hand_pose[:, 3:]), dtype=wp.quatd)
 
-    def touch(self, posture: Posture, reach: float) -> tuple[Any, Any]:
+    def nearest_points(self, posture: Posture, reach: float) -> tuple[Any, Any]:
         """Return the bodies of posed hands, and the object's surface within `reach` [m] of their points."""
         count = len(posture)
         root = np.array(posture.hand_pose, float)
@@ -83,7 +83,7 @@ class PostureData:
         `part` (points,) is the part of each hand point; points with -1 are ignored."""
         found = np.full((len(posture), count), reach)
         for rows in self.row_slices(len(posture)):
-            distance = self.touch(posture.take(rows), reach)[1].distance.numpy()
+            distance = self.nearest_points(posture.take(rows), reach)[1].distance.numpy()
             for one in np.unique(part[part >= 0]):
                 found[rows, one] = distance[:, part == one].min(axis=1)
         return found

@@ -91,9 +91,9 @@ class Probe:
                 indices=wp.array(obj.faces.ravel(), dtype=wp.int32),
                 support_winding_number=not obj.watertight,
             )
-        self.skin = self._skin()
+        self.skin = self._device_surface()
 
-    def _skin(self) -> Any:
+    def _device_surface(self) -> Any:
         obj, margin = self.obj, 1e-4
         low = obj.vertices.min(axis=0) - obj.centre_of_mass - REACH_M - margin
         high = obj.vertices.max(axis=0) - obj.centre_of_mass + REACH_M + margin
@@ -159,7 +159,7 @@ class Probe:
         """Return the hand points (B, N, 3) for body poses (B, L, 7), object frame [m]."""
         return _rotate_with_bodies(bodies, self.points.body, self.points.position) + bodies[:, self.points.body, :3]
 
-    def touch(self, posture: Posture, *, reach: float = REACH_M) -> NearestPoints:
+    def nearest_points(self, posture: Posture, *, reach: float = REACH_M) -> NearestPoints:
         """Return the object's surface near the hand points of B postures, within `reach` [m]."""
         bodies = body_poses(self.hand, posture.hand_pose, posture.joint_positions)
         points = self.posed_points(bodies)
@@ -176,7 +176,7 @@ class Probe:
 
     def measure(self, posture: Posture) -> Distances:
         """Measure all distances of B postures from the object, within `REACH_M`."""
-        found = self.touch(posture)
+        found = self.nearest_points(posture)
         return Distances(
             **vars(found),
             piece_distance=self._piece_distances(found.bodies),

@@ -175,15 +175,15 @@ def _unobstructed_cameras(draw: Callable[[], list[Floats]], supports: Supports, 
     if not any(isinstance(s, BoxSupport) for s in supports):
         return drawn
 
-    def seen(camera: Floats) -> float:
+    def visible_share_from(camera: Floats) -> float:
         return scenery.visible_share(supports, -camera[:3, :3].T @ camera[:3, 3], points)
 
-    share = [seen(camera) for camera in drawn]
+    share = [visible_share_from(camera) for camera in drawn]
     for _ in range(_DRAWS):
         if min(share) >= _SEEN:
             break
         for k, camera in enumerate(draw()):
-            if share[k] < _SEEN and (found := seen(camera)) > share[k]:
+            if share[k] < _SEEN and (found := visible_share_from(camera)) > share[k]:
                 drawn[k], share[k] = camera, found
     return drawn
 

@@ -285,6 +285,6 @@ def png_bytes(image: Image.Image) -> bytes:
     return buffer.getvalue()
 
 
-def with_palette(page: bytes) -> bytes:
+def reduce_to_palette(page: bytes) -> bytes:
     """Return the PNG in 256 colours, for documentation: a third of the bytes."""
     return png_bytes(Image.open(io.BytesIO(page)).convert("RGB").quantize(256, method=Image.Quantize.MEDIANCUT))

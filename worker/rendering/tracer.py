@@ -130,11 +130,11 @@ class _ShotRenderer:
         ]
         outputs = [rgb, depth, shape, normal]
 
-        def rows(first: int) -> None:
+        def render_rows(first: int) -> None:
             dim = (size[0], len(range(first, size[1], threads)), size[2])
             wp.launch(exposure.expose, dim=dim, inputs=[*inputs, first], outputs=outputs, device=device)
 
-        list(pool.map(rows, range(threads)))
+        list(pool.map(render_rows, range(threads)))
         return tuple(array.numpy() for array in outputs)
 
 

@@ -57,10 +57,10 @@ def merge_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Flo
     left = list(pieces)
     volume = [union_volume((piece,)) for piece in left]
 
-    def added(a: int, b: int) -> float:
+    def added_volume(a: int, b: int) -> float:
         return union_volume((np.concatenate([left[a], left[b]]),)) - volume[a] - volume[b]
 
-    cost = {(a, b): added(a, b) for a, b in combinations(range(len(left)), 2)} if len(left) > most else {}
+    cost = {(a, b): added_volume(a, b) for a, b in combinations(range(len(left)), 2)} if len(left) > most else {}
     alive = set(range(len(left)))
     while len(alive) > most:
         a, b = min(cost, key=lambda pair: cost[pair])
@@ -68,7 +68,7 @@ def merge_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Flo
         volume.append(union_volume((left[-1],)))
         alive -= {a, b}
         cost = {pair: value for pair, value in cost.items() if not {a, b} & set(pair)}
-        cost |= {(k, len(left) - 1): added(k, len(left) - 1) for k in alive}
+        cost |= {(k, len(left) - 1): added_volume(k, len(left) - 1) for k in alive}
         alive.add(len(left) - 1)
     return tuple(left[k] for k in sorted(alive))
 
@@ -144,12 +144,12 @@ def _place_objects(
     poses = rest_poses(spec, obj, count=count, seed=seed)
     alone, size = poses["scene/object_pose"], walled_area(spec)
 
-    def again(scene: int, draw: int) -> Floats:
+    def draw_pose(scene: int, draw: int) -> Floats:
         if size is None or not draw:
             return alone[scene]
         return move_inside(obj, alone[scene], size, np.random.default_rng([seed, scene, draw]))
 
-    found, beside = place_neighbours(obj, again, others, supports, within=size, count=len(alone), seed=seed)
+    found, beside = place_neighbours(obj, draw_pose, others, supports, within=size, count=len(alone), seed=seed)
     return {**poses, "scene/object_pose": found, "scene/neighbour_pose": beside}
 
 

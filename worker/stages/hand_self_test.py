@@ -133,10 +133,10 @@ def self_test(
     best: BestGrasp | None = None
     objects = plain_objects(width)
     for number, (name, obj) in enumerate(objects.items()):
-        part = run.part(number / len(objects), (number + 1) / len(objects))
+        part = run.with_progress_range(number / len(objects), (number + 1) / len(objects))
         free, standing = (count // 3 + (number < count % 3) for count in (grasps, on_table))
-        found = _plan_batches(hand, obj, free, part.part(0.0, 0.7))
-        lifted += [_test_lifts(hand, obj, standing, part.part(0.7, 1.0))]
+        found = _plan_batches(hand, obj, free, part.with_progress_range(0.0, 0.7))
+        lifted += [_test_lifts(hand, obj, standing, part.with_progress_range(0.7, 1.0))]
         held[name] = [bool(value == 1) for batch in found for value in batch.columns["quality/success"]]
         lost += [bool(one) for batch in found for one in _lost_in_closing(batch)]
         better = [_best_grasp(obj, batch) for batch in found]

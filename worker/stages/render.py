@@ -46,7 +46,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         width=request.width,
         height=request.height,
         seed=batch_seed(message),
-        run=context.run.part(0.0, 1.0),
+        run=context.run.with_progress_range(0.0, 1.0),
         extras=extras,
     )
     return Output(pictures, attributes)

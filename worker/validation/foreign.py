@@ -99,10 +99,12 @@ def transfer_grasps(same: HandMatch, grasps: GraspSet) -> GraspSet:
     """Return the grasps as postures of the other model: base transformed, joints matched by name.
     Joints that only the other model couples take the nearest feasible values."""
 
-    def posture(part: Posture) -> Posture:
+    def transfer_posture(part: Posture) -> Posture:
         pose, joints = compose(part.hand_pose, same.base), part.joint_positions[:, same.joints]
         free = same.theirs.dofs == len(same.theirs.joint_names)
         return Posture(pose, joints if free else nearest_feasible_joints(same.theirs, joints))
 
     loss = np.asarray(grasps.stability_loss, float)
-    return GraspSet(posture(grasps.grasp), posture(grasps.pregrasp), posture(grasps.squeeze), loss)
+    return GraspSet(
+        transfer_posture(grasps.grasp), transfer_posture(grasps.pregrasp), transfer_posture(grasps.squeeze), loss
+    )

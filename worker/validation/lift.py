@@ -22,7 +22,7 @@ from graspd.service.model.transforms import Floats, invert, quat_conjugate, quat
 from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.simulation.environment import RISE_M, PlacedGrasps
-from graspd.worker.validation.model import Scene, blend
+from graspd.worker.validation.model import Scene, interpolate_postures
 from graspd.worker.validation.protocol import MAX_PENETRATION_M, MAX_ROTATION, STAGE_S, STAGES, Outcome, Rollout, Test
 
 #: Largest displacement [m] and tilt [rad] of a neighbour; rotation about the vertical is allowed.
@@ -119,7 +119,7 @@ class Lift(Test):
         return rollout
 
     def _set_posture(self, hand_pose: Floats, joints: Floats) -> None:
-        self.scene.place(self.data, hand_pose, joints)
+        self.scene.set_posture(self.data, hand_pose, joints)
         self.data.mocap_pos[1], self.data.mocap_quat[1] = self._scene_pose[:3], self._scene_pose[3:]
         self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push_force * self._up
         for free, pose in zip(self.scene.neighbours, self._beside, strict=True):
@@ -148,7 +148,7 @@ class Lift(Test):
                 if self._in_contact(pose, joints):
                     return True
         wide, closed = Posture(path[-1:], joints[None]), grasps.pregrasp.take(slice(row, row + 1))
-        return any(self._in_contact(*blend(wide, closed, 0, float(share))) for share in shares)
+        return any(self._in_contact(*interpolate_postures(wide, closed, 0, float(share))) for share in shares)
 
     def _in_contact(self, hand_pose: Floats, joints: Floats) -> bool:
         self._set_posture(hand_pose, joints)

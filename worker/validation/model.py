@@ -107,7 +107,7 @@ class Scene:
         """Force of a push, and weight of the object [N]."""
         return ACCELERATION * self.mass
 
-    def place(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
+    def set_posture(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
         """Reset `data` with the hand in a posture (7,), (J,) and the object at its initial pose."""
         mujoco.mj_resetData(self.model, data)
         data.qpos[self.object_qpos : self.object_qpos + 7] = [*self.centre, 1, 0, 0, 0]
@@ -381,7 +381,7 @@ def add_support(spec: Any, geom: Any, support: Obstacle) -> None:
     mujoco.mju_quatZ2Vec(geom.quat, normal)
 
 
-def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Floats]:
+def interpolate_postures(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Floats]:
     """Interpolate postures a and b at `share`: positions and joints linearly, orientations by slerp."""
     start, end = a.hand_pose[row], b.hand_pose[row]
     pose = np.concatenate([(1 - share) * start[:3] + share * end[:3], slerp(start[3:], end[3:], share)])

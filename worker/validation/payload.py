@@ -302,7 +302,7 @@ def load_capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: 
     """Compute load capacities (N,) [kg]; 0 without contact, inf if neither drives nor friction limit it.
     `against` (N, K, 3) are unit vectors against the weight; the least of the K capacities is returned."""
     probe = posture_data_of(hand, obj, points=_POINTS, device="cpu").probe
-    found = probe.touch(grasp)
+    found = probe.nearest_points(grasp)
     facing = (found.distance < WITHIN_M) & probe.facing_mask(found)
     spread, count = spread_contacts(facing[:, None], found.closest, found.normal, scale=obj.radius, limit=MOST)
     q = hand.reduce(grasp.joint_positions)

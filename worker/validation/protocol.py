@@ -20,7 +20,7 @@ import numpy as np
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.validation.model import Scene, blend
+from graspd.worker.validation.model import Scene, interpolate_postures
 
 DIRECTIONS: Final = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 MAX_DISPLACEMENT_M: Final = 0.05
@@ -137,7 +137,7 @@ class Test:
         return rollout
 
     def _set_posture(self, hand_pose: Floats, joints: Floats) -> None:
-        self.scene.place(self.data, hand_pose, joints)
+        self.scene.set_posture(self.data, hand_pose, joints)
 
     def _depths(self, posture: Posture, row: int) -> tuple[float, float]:
         self._set_posture(posture.hand_pose[row], posture.joint_positions[row])
@@ -176,7 +176,7 @@ class Test:
         """Yield commanded postures (7,), (J,) from pregrasp through grasp to squeeze, one per stage."""
         for a, b in ((grasps.pregrasp, grasps.grasp), (grasps.grasp, grasps.squeeze)):
             for stage in range(1, stages + 1):
-                yield blend(a, b, row, stage / stages)
+                yield interpolate_postures(a, b, row, stage / stages)
 
     def _save(self) -> None:
         mujoco.mj_getState(self.scene.model, self.data, self._saved, mujoco.mjtState.mjSTATE_INTEGRATION)

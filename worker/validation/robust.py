@@ -48,7 +48,7 @@ class Robustness:
         After an early end the share is a lower bound if the wanted share was reached, else an upper bound."""
         models = self.held.shape[1]
         held, failed = (self.held == 1).sum(axis=1), (self.held == 0).sum(axis=1)
-        reached = held >= needed_models(self.wanted, models)
+        reached = held >= required_model_count(self.wanted, models)
         share = np.where(reached, held, models - failed) / models
         return np.where((self.held == NOT_VALIDATED).all(axis=1), np.nan, share)
 
@@ -69,7 +69,7 @@ class Robustness:
         return {axis: (int(held.sum()), len(held)) for axis, held in validated.items() if len(held)}
 
 
-def needed_models(wanted: float, models: int) -> int:
+def required_model_count(wanted: float, models: int) -> int:
     """Return the number of models in which a grasp must hold for a wanted share; all of them for share 0."""
     return math.ceil(wanted * models - _EXACT) if wanted > 0 else models
 
@@ -115,14 +115,14 @@ def validate_robustness(
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
     beside = (placed.supports, placed.neighbours) if placed is not None else ()
     around = Models(hand, obj, pieces or decompose(obj), physics, *beside)
-    least, done = needed_models(wanted, models), Count(len(tried), run, "robustness")
+    least, done = required_model_count(wanted, models), Count(len(tried), run, "robustness")
 
     def holds(row: int, variant: Variant) -> bool:
         if placed is None:
             return around.standard(grasps, row, variant).success
         return around.lift(grasps, row, placed, variant, dexgraspbench=level == "dexgraspbench").success
 
-    def work(row: int) -> None:
+    def validate_row(row: int) -> None:
         for k, (axis, variant) in enumerate(draw_models(hand, grasps, row, models, seed)):
             run.check("robustness")
             axes[row, k] = axis
@@ -133,7 +133,7 @@ def validate_robustness(
         done.add(1)
 
     with ThreadPoolExecutor(run.cores, thread_name_prefix="robust") as pool:
-        list(pool.map(work, tried.tolist()))
+        list(pool.map(validate_row, tried.tolist()))
     return Robustness(verdicts, axes, wanted, time.perf_counter() - began)
 
 

@@ -23,7 +23,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import Neighbour, Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import Lift, LiftResult
-from graspd.worker.validation.model import MujocoOptions, Scene, blend, build_scene, scene_of
+from graspd.worker.validation.model import MujocoOptions, Scene, build_scene, interpolate_postures, scene_of
 from graspd.worker.validation.protocol import STAGES, Rollout, Test
 from graspd.worker.validation.refit import Fit, applicable_fits, refit_hand
 
@@ -222,7 +222,7 @@ class Models:
     def standard(self, grasps: GraspSet, row: int, variant: Variant) -> Rollout:
         """Validate one grasp in a variant at level standard, for the nominal one bit for bit as `validate`."""
         test = VariantTest(self.scene(variant), variant, self._lags(variant))
-        return test.standard(self._project_joints(test.scene, displaced_grasp(self.obj, grasps, row, variant)), 0)
+        return test.standard(self._project_joints(test.scene, displace_grasp(self.obj, grasps, row, variant)), 0)
 
     def lift(
         self, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, *, dexgraspbench: bool = False
@@ -231,7 +231,7 @@ class Models:
         `placed` has the scenes of all grasps. `dexgraspbench`: run the published test, which needs no approach."""
         number = int(placed.index[row])
         variant = restrict_to_support(variant, placed.scenes[number].up)
-        one, where = displaced_grasp(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))
+        one, where = displace_grasp(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))
         if moves_object(variant):
             pose = compose(placed.object_pose[number], object_motion(self.obj, variant))
             beside = placed.neighbour_pose[number : number + 1]
@@ -287,7 +287,7 @@ class _DelayedFingersTest(Test):
         for stage in range(1, 2 * stages + 1):
             even = stage / stages
             part = int(even >= 1)
-            pose, _ = blend(parts[part], parts[part + 1], row, even - part)
+            pose, _ = interpolate_postures(parts[part], parts[part + 1], row, even - part)
             # Delayed joints move faster, so that all arrive at the same time.
             late = np.clip((even / 2 - self._lags) / (1 - self._lags.max()), 0, 1) * 2
             joints = [part.joint_positions[row] for part in parts]
@@ -348,19 +348,24 @@ def _perturbed_scene(scene: Scene, variant: Variant) -> Scene:
     return replace(scene, model=model)
 
 
-def displaced_grasp(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> GraspSet:
+def displace_grasp(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> GraspSet:
     """Return one grasp relative to the object, for a variant that displaces object or hand."""
     one = grasps.take(np.array([row]))
     if not (moves_object(variant) or any(variant.hand_shift_m)):
         return one
     back, off = invert(object_motion(obj, variant)), np.array([*variant.hand_shift_m, 1.0, 0, 0, 0])
 
-    def moved(part: Posture) -> Posture:
+    def displace(part: Posture) -> Posture:
         return Posture(compose(compose(back, part.hand_pose), off), part.joint_positions)
 
     way = None if one.approach is None else compose(compose(back, one.approach), off)
     return replace(
-        one, grasp=moved(one.grasp), pregrasp=moved(one.pregrasp), squeeze=moved(one.squeeze), approach=way, lift=None
+        one,
+        grasp=displace(one.grasp),
+        pregrasp=displace(one.pregrasp),
+        squeeze=displace(one.squeeze),
+        approach=way,
+        lift=None,
     )
 
 

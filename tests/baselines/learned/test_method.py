@@ -176,7 +176,7 @@ def test_what_it_cannot_do_is_said_in_a_line(hand, network, tmp_path: Path) -> N
 
 
 def test_points_lie_on_the_surface_and_are_seen_by_the_camera() -> None:
-    seen, rng = SurfaceView.of(MUG), np.random.default_rng(3)
+    seen, rng = SurfaceView.from_object(MUG), np.random.default_rng(3)
     mesh = trimesh.Trimesh(apply(POSE, MUG.vertices), MUG.faces, process=False)
     for _ in range(3):
         camera = seen.camera(POSE, rng)
@@ -196,7 +196,7 @@ def test_points_lie_on_the_surface_and_are_seen_by_the_camera() -> None:
 
 
 def test_cameras_stand_where_pictures_have_them() -> None:
-    seen, rng = SurfaceView.of(MUG), np.random.default_rng(0)
+    seen, rng = SurfaceView.from_object(MUG), np.random.default_rng(0)
     middle = apply(POSE, MUG.centre_of_mass)
     out = np.array([seen.camera(POSE, rng) - middle for _ in range(200)])
     distance = np.linalg.norm(out, axis=1)

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from graspd.service.index.changes.records import Changes
 from graspd.service.index.rebuild import differences
 from graspd.service.model.messages import FIRST_SCHEMA, Requirements, WorkerHeartbeat, capabilities
-from graspd.service.model.planning import needed_schema
+from graspd.service.model.planning import required_schema
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import SCHEMA_OF_RANGES, STAGE_REVISIONS, TASK_SCHEMA
@@ -77,9 +77,9 @@ def test_what_nobody_can_do_is_held_with_the_reason(
 
 def test_a_task_asks_for_the_schema_of_its_newest_field() -> None:
     since = {"friction": 3, "touch": 4}
-    assert needed_schema(request(), since) == OWN.schemas[0]
-    assert needed_schema(request(friction=0.5), since) == 3
-    assert needed_schema(request(friction=0.5, fidelity="draft"), {**since, "fidelity": 4}) == 4
+    assert required_schema(request(), since) == OWN.schemas[0]
+    assert required_schema(request(friction=0.5), since) == 3
+    assert required_schema(request(friction=0.5, fidelity="draft"), {**since, "fidelity": 4}) == 4
 
 
 def test_a_worker_that_does_not_say_what_it_can_is_given_no_task() -> None:

@@ -56,7 +56,7 @@ def opened_by_numpy(probe: Probe, grasp: Posture) -> Posture:
     hand = probe.hand
     q = hand.reduce(grasp.joint_positions)
     finger = opening.fingers_of_dofs(hand)
-    paths = _openings(hand, q, _leaving(probe, probe.touch(grasp, reach=opening.CLEARANCE_M), finger))
+    paths = _openings(hand, q, _leaving(probe, probe.nearest_points(grasp, reach=opening.CLEARANCE_M), finger))
     clearance = _finger_clearance(probe, grasp.hand_pose, paths)
     stuck = np.flatnonzero((clearance.max(axis=1) < opening.STUCK_M).any(axis=1))
     if len(stuck):
@@ -167,7 +167,7 @@ def _retreat(probe: Probe, hand_pose: Floats, q: Floats) -> Posture:
 
 def balanced_by_numpy(probe: Probe, grasp: Posture, total: float, *, closing: float) -> list[tuple[float, Floats]]:
     """Residual and torques (D,) of the forces that balance in each grasp; least squares by SciPy."""
-    found = probe.touch(grasp, reach=max(postures.PRESSING_M, closing))
+    found = probe.nearest_points(grasp, reach=max(postures.PRESSING_M, closing))
     pressing = probe.facing_mask(found) & (found.distance < postures.PRESSING_M)
     finger = finger_of_body(probe.hand)[probe.points.body]
     for f in range(finger.max() + 1):
@@ -403,7 +403,7 @@ def test_forces_balance_and_idle_fingers_close_as_in_numpy(case: tuple[HandModel
 
 def test_links_in_contact_are_counted_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
     hand, probe, grasp = case
-    near = probe.touch(grasp, reach=LINK_CONTACT_M).distance < LINK_CONTACT_M
+    near = probe.nearest_points(grasp, reach=LINK_CONTACT_M).distance < LINK_CONTACT_M
     wanted = [len(np.unique(probe.points.body[one])) for one in near]
     assert postures.count_touching_links(hand, OBJ, grasp).tolist() == wanted and len(set(wanted)) > 2
 

@@ -166,7 +166,7 @@ def _apart(hand: HandModel, q: np.ndarray) -> float:
     obj = object_from_mesh(trimesh.creation.box((0.02, 0.02, 0.02)))
     scene = build_scene(hand, obj, decompose(obj), MujocoOptions())
     data = mujoco.MjData(scene.model)
-    scene.place(data, np.array([0, 0, 1.0, 1, 0, 0, 0]), hand.expand(q))
+    scene.set_posture(data, np.array([0, 0, 1.0, 1, 0, 0, 0]), hand.expand(q))
     mujoco.mj_forward(scene.model, data)
     first, second = (int(np.flatnonzero(scene.model.geom_bodyid == scene.model.body(f"body{b}").id)[0]) for b in (1, 2))
     return float(mujoco.mj_geomDistance(scene.model, data, first, second, 1.0, None))

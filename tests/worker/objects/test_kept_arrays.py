@@ -152,7 +152,7 @@ def test_whatever_it_follows_from_makes_another_entry(built: list[float], monkey
 
 
 def test_the_revision_follows_the_code_and_the_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(disk_cache, "revision", disk_cache.revision.__wrapped__)
+    monkeypatch.setattr(disk_cache, "code_revision", disk_cache.code_revision.__wrapped__)
     plain = prepare.revision.__wrapped__()
     monkeypatch.setattr(disk_cache, "version_of", lambda name: f"0 of {name}")
     libraries = prepare.revision.__wrapped__()

@@ -33,7 +33,7 @@ from graspd.worker.validation.variant import (
     Models,
     Variant,
     VariantLift,
-    displaced_grasp,
+    displace_grasp,
     object_motion,
     restrict_to_support,
 )
@@ -294,7 +294,7 @@ def test_an_object_that_stands_off_slides_and_the_hand_stays() -> None:
     assert variant.object_shift_m[:2] == (0.001, -0.0015)
     assert np.cross(variant.object_turn, up) == pytest.approx([0, 0, 0], abs=1e-12)
     assert np.linalg.norm(variant.object_turn) == pytest.approx(0.02)
-    one, motion = displaced_grasp(BOX, MANY, 5, variant), object_motion(BOX, variant)
+    one, motion = displace_grasp(BOX, MANY, 5, variant), object_motion(BOX, variant)
     # Hand, seen from where the object stands, and from where it was thought to be: the same place in the world.
     pregrasps = one.pregrasp.hand_pose[0], MANY.pregrasp.hand_pose[5]
     for now, thought in (pregrasps, (one.approach[0, 0], MANY.approach[5, 0])):

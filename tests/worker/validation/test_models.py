@@ -14,7 +14,7 @@ from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.matter import MASS_KG
 from graspd.service.model.metrics import PerturbedParameter
 from graspd.service.model.transforms import IDENTITY_POSE, apply
-from graspd.studies.evaluation import combine, evaluate
+from graspd.studies.evaluation import combine_rows, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.hand_matching import match_hands
@@ -30,7 +30,7 @@ from graspd.worker.validation.model import MujocoOptions, Scene, build_scene
 from graspd.worker.validation.prefilter.prefilter import prefilter_key_terms
 from graspd.worker.validation.protocol import STAGES, Outcome, Rollout, Test
 from graspd.worker.validation.refit import applicable_fits, offset_piece, refit_hand
-from graspd.worker.validation.robust import Robustness, draw_models, needed_models, validate_robustness
+from graspd.worker.validation.robust import Robustness, draw_models, required_model_count, validate_robustness
 from graspd.worker.validation.validator import validate
 from graspd.worker.validation.variant import (
     NOMINAL,
@@ -38,7 +38,7 @@ from graspd.worker.validation.variant import (
     Variant,
     VariantTest,
     axes_of,
-    displaced_grasp,
+    displace_grasp,
     draw_variant,
     replace_coupling,
 )
@@ -126,7 +126,7 @@ def test_the_weakest_axis_is_that_of_the_first_model_that_fails() -> None:
     ("wanted", "models", "least"), [(0.9, 8, 8), (0.75, 8, 6), (0.9, 10, 9), (1.0, 3, 3), (0.1, 4, 1)]
 )
 def test_so_many_models_make_a_share(wanted: float, models: int, least: int) -> None:
-    assert needed_models(wanted, models) == least
+    assert required_model_count(wanted, models) == least
 
 
 def test_a_grasp_meets_the_same_models_each_axis_once() -> None:
@@ -279,16 +279,16 @@ def test_the_centre_of_mass_moves_and_the_object_stays() -> None:
     assert data.xipos[scene.object_body] == pytest.approx(BOX.centre_of_mass + shift, abs=1e-9)
     assert data.geom("object-0").xpos == pytest.approx(BOX.centre_of_mass, abs=1e-7)
     test = Test(scene)
-    scene.place(test.data, FAR, np.zeros(2))
+    scene.set_posture(test.data, FAR, np.zeros(2))
     assert test._object_displacement() == pytest.approx([0, 0, 0], abs=1e-12), "the mesh's frame is where it was"
 
 
 def test_object_or_a_hand_that_is_off_is_met_the_other_way_round() -> None:
     grasps = many_grasps()
     shift, turn = (0.001, -0.002, 0.0005), (0.0, 0.0, 0.03)
-    moved = displaced_grasp(BOX, grasps, 3, Variant(object_shift_m=shift))
+    moved = displace_grasp(BOX, grasps, 3, Variant(object_shift_m=shift))
     assert moved.pregrasp.hand_pose[0, :3] == pytest.approx(grasps.pregrasp.hand_pose[3, :3] - shift)
-    turned = displaced_grasp(BOX, grasps, 3, Variant(object_turn=turn)).grasp.hand_pose[0]
+    turned = displace_grasp(BOX, grasps, 3, Variant(object_turn=turn)).grasp.hand_pose[0]
     arm = grasps.grasp.hand_pose[3, :3] - BOX.centre_of_mass
     back = np.array([[np.cos(0.03), np.sin(0.03), 0], [-np.sin(0.03), np.cos(0.03), 0], [0, 0, 1]])
     assert turned[:3] == pytest.approx(BOX.centre_of_mass + back @ arm, abs=1e-12)
@@ -297,7 +297,7 @@ def test_object_or_a_hand_that_is_off_is_met_the_other_way_round() -> None:
     quarter = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
     for part in (grasps.grasp, grasps.pregrasp, grasps.squeeze):
         part.hand_pose[:, 3:] = quarter
-    off = displaced_grasp(BOX, grasps, 2, Variant(hand_shift_m=(0.002, 0, 0)))
+    off = displace_grasp(BOX, grasps, 2, Variant(hand_shift_m=(0.002, 0, 0)))
     assert off.grasp.hand_pose[0, :3] - grasps.grasp.hand_pose[2, :3] == pytest.approx([0, 0.002, 0], abs=1e-12)
 
 
@@ -475,7 +475,7 @@ def test_a_model_with_other_pads_says_otherwise(tmp_path) -> None:
 def test_rows_add_up_by_their_grasps(tmp_path) -> None:
     row = evaluate(plates_case(), validation_hand=match_hands(PADS_HAND, PADS_HAND), cache=tmp_path)
     lost = {**row, "foreign_held": {"both": 0, "nominal": 1, "foreign": 1, "neither": 0}, "fingertips_mm": 0.4}
-    whole = combine([row, lost])
+    whole = combine_rows([row, lost])
     assert whole["foreign_held"] == {"both": 2, "nominal": 1, "foreign": 1, "neither": 1}
     assert (whole["agreement"], whole["foreign_share"]) == (pytest.approx(3 / 5), pytest.approx(2 / 3, abs=1e-6))
     assert whole["fingertips_mm"] == 0.4

@@ -25,7 +25,7 @@ from graspd.worker.validation import decomposition, model, protocol
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.displacement import GRAVITY, STEPS, TIMESTEP_S, simulated_displacement_cm
 from graspd.worker.validation.key import LEVEL_MOVES, MOVES, Level, verdict_key
-from graspd.worker.validation.model import MujocoOptions, blend, build_scene, scene_of
+from graspd.worker.validation.model import MujocoOptions, build_scene, interpolate_postures, scene_of
 from graspd.worker.validation.protocol import HOLD_S, MAX_DISPLACEMENT_M, MAX_ROTATION, Outcome, Rollout, Test
 from graspd.worker.validation.validator import validate
 from tests.worker.models import object_from_mesh, on_one_dof, two_finger_hand
@@ -99,7 +99,7 @@ def test_displacement_is_that_of_the_mesh_s_own_frame() -> None:
     far = object_from_mesh(mesh)
     scene = build_scene(PADS, far, ConvexPieces((far.hull_vertices,), 1.0, 0.0, "far"), MujocoOptions())
     test = Test(scene)
-    scene.place(test.data, FAR, np.zeros(2))
+    scene.set_posture(test.data, FAR, np.zeros(2))
     assert test._object_motion() == (pytest.approx(0, abs=1e-12), 0)
     angle = 0.2
     turned = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
@@ -111,7 +111,7 @@ def test_displacement_is_that_of_the_mesh_s_own_frame() -> None:
 def test_the_root_turns_at_an_even_rate_between_two_postures() -> None:
     half = np.array([[0.0, 0, 0, 1, 0, 0, 0], [0.0, 0, 0, 0, 0, 0, 1.0]])
     a, b = (Posture(row[None], np.zeros((1, 2))) for row in half)
-    turns = [2 * np.arctan2(*blend(a, b, 0, share)[0][[6, 3]]) for share in (0.1, 0.5, 0.9)]
+    turns = [2 * np.arctan2(*interpolate_postures(a, b, 0, share)[0][[6, 3]]) for share in (0.1, 0.5, 0.9)]
     assert turns == pytest.approx([0.1 * np.pi, 0.5 * np.pi, 0.9 * np.pi])
 
 

@@ -168,10 +168,10 @@ def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarr
         library.find_element(shown.get("url")) if shown is not None else root.find("library_visual_scenes/visual_scene")
     )
 
-    def below(node: Element) -> list[Element]:
+    def child_nodes(node: Element) -> list[Element]:
         return node.findall("node") + [library.find_element(i.get("url")) for i in node.findall("instance_node")]
 
-    for node, matrix in walk_scene(scene.findall("node") if scene is not None else [], _node_transform, below):
+    for node, matrix in walk_scene(scene.findall("node") if scene is not None else [], _node_transform, child_nodes):
         if node.find("instance_controller") is not None:
             raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without bones")
         for instance in node.findall("instance_geometry"):

@@ -78,10 +78,10 @@ def _instances(document: dict[str, Any]) -> Iterator[tuple[int, np.ndarray]]:
         below = {int(child) for node in nodes for child in node.get("children", [])}
         roots = [root for root in range(len(nodes)) if root not in below]
 
-    def named(indices: Iterable[Any]) -> Iterator[dict[str, Any]]:
+    def nodes_of(indices: Iterable[Any]) -> Iterator[dict[str, Any]]:
         return (_document_item(document, "nodes", index) for index in indices)
 
-    for node, matrix in walk_scene(named(roots), _node_transform, lambda node: named(node.get("children", []))):
+    for node, matrix in walk_scene(nodes_of(roots), _node_transform, lambda node: nodes_of(node.get("children", []))):
         _refuse_extensions(node)
         _refuse_morphs(node)
         if "skin" in node:

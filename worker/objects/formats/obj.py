@@ -29,7 +29,7 @@ def read(data: bytes, nearby: Nearby = no_files) -> Soup:
     vertices, shades = list[list[bytes]](), list[list[bytes]]()
     corners, counts = list[int](), list[int]()
     libraries, used = list[bytes](), list[tuple[int, bytes]]()
-    for line in _lines(data):
+    for line in _logical_lines(data):
         if line.startswith(b"v "):
             numbers = line.split(None, 7)[1:7]
             vertices.append(numbers[:3])
@@ -93,7 +93,7 @@ def _parse_index(text: bytes, count: int) -> int:
     return index - 1 if index > 0 else count + index
 
 
-def _lines(data: bytes) -> Iterable[bytes]:
+def _logical_lines(data: bytes) -> Iterable[bytes]:
     pending = b""
     for raw in data.splitlines():
         line = raw.strip()
