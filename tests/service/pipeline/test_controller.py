@@ -234,7 +234,7 @@ def test_redis_lost_whole_loses_no_task(bench: Bench) -> None:
     empty = MemoryQueue()
     bench = Bench(Services(bench.services.settings, bench.services.store, bench.services.index, empty))
     bench.pass_time(LOST_AFTER_S + 2)
-    assert len(empty.waiting()) == 3, "two syntheses, and the scene of the shard whose event was lost"
+    assert len(empty.waiting_tasks()) == 3, "two syntheses, and the scene of the shard whose event was lost"
     bench.work_off()
     assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
     assert differences(bench.services.index, bench.services.store) == []

@@ -265,7 +265,7 @@ def test_a_lease_that_is_none_keeps_nobody_from_leading(rq_queue: RqQueue, forge
 
 
 @pytest.mark.parametrize(
-    ("command", "ask"), [("smembers", RqQueue.waiting), ("set", lambda queue: queue.renew_leadership("a", 600))]
+    ("command", "ask"), [("smembers", RqQueue.waiting_tasks), ("set", lambda queue: queue.renew_leadership("a", 600))]
 )
 def test_what_redis_forbids_is_told(rq_queue: RqQueue, redis_server: str, command: str, ask: Any) -> None:
     rights = ["+@all", f"-{command}"]

@@ -405,7 +405,7 @@ def test_links_in_contact_are_counted_as_in_numpy(case: tuple[HandModel, Probe, 
     hand, probe, grasp = case
     near = probe.nearest_points(grasp, reach=LINK_CONTACT_M).distance < LINK_CONTACT_M
     wanted = [len(np.unique(probe.points.body[one])) for one in near]
-    assert postures.count_touching_links(hand, OBJ, grasp).tolist() == wanted and len(set(wanted)) > 2
+    assert postures.touching_links(hand, OBJ, grasp).tolist() == wanted and len(set(wanted)) > 2
 
 
 def grasp_of(hand: HandModel) -> Posture:

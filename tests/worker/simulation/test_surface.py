@@ -261,7 +261,7 @@ def test_another_cell_faces_or_binary_is_another_grid(computed: list, monkeypatc
 def test_an_entry_that_would_lead_kernels_astray_is_made_again(computed, own_cache, name: str, change) -> None:
     first = kept_grid()
     (file,) = own_cache.rglob("object_grids/*")
-    arrays = disk_cache._read_records(file)
+    arrays = disk_cache._read(file)
     array = arrays.pop(name)
     disk_cache._write(file, arrays | ({name: change(array)} if change else {}))
     for _ in range(2):  # the second time the entry is whole again

@@ -266,7 +266,7 @@ def test_a_heavier_object_is_pushed_by_its_weight() -> None:
         test = VariantTest(around.scene(variant), variant, None)
         test._close(grasps, 0)
         test._push(2)
-        test._run_rounds(0.1)
+        test._run(0.1)
         moved.append(test._object_displacement()[1])
     # The same acceleration of 10 m/s^2, half a step of velocity added by the implicit step.
     assert moved == pytest.approx([0.5 * 10 * 0.1 * (0.1 + 0.004)] * 2, rel=1e-6)

@@ -122,13 +122,13 @@ def test_push_from_the_saved_state_is_a_push_after_closing_anew() -> None:
         test._close(grasps, 3)
         test._save()
         test._push(0)
-        test._run_rounds(0.4)
+        test._run(0.4)
         if anew:
             test._close(grasps, 3)
         else:
             test._restore()
         test._push(2)
-        test._run_rounds(0.4)
+        test._run(0.4)
         ends.append(test.data.qpos.copy())
     assert np.array_equal(*ends)
 
@@ -291,7 +291,7 @@ def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(level: str, tmp_p
     assert rollout.outcomes[0] is Outcome.DIVERGED and not rollout.success
     # What the guard is for: after MuJoCo's reset the object stands where it began.
     assert test._object_motion()[0] < 0.05 and is_invalid(test.data)
-    test._mark_running(grasp_of(), 0)
+    test._set_up_test(grasp_of(), 0)
     assert not is_invalid(test.data)
     assert list(tmp_path.iterdir()) == [], "MuJoCo's warnings go to no file"
 
@@ -324,17 +324,17 @@ class Scripted(Test):
     """A push in which displacement and rotation, over their limits, follow functions of time [s]."""
 
     def __init__(self, moved, turned) -> None:
-        self._moved, self._rotation, self.elapsed = moved, turned, 0.0
+        self._moved, self._turned, self.elapsed = moved, turned, 0.0
         self.data = mujoco.MjData(mujoco.MjSpec().compile())
 
     def _run(self, seconds: float) -> None:
         self.elapsed += seconds
 
-    def _offset(self) -> np.ndarray:
+    def _object_displacement(self) -> np.ndarray:
         return np.array([MAX_DISPLACEMENT_M * self._moved(self.elapsed), 0.0, 0.0])
 
-    def _motion(self) -> tuple[float, float]:
-        return float(np.linalg.norm(self._object_displacement())), MAX_ROTATION * self._rotation(self.elapsed)
+    def _object_motion(self) -> tuple[float, float]:
+        return float(np.linalg.norm(self._object_displacement())), MAX_ROTATION * self._turned(self.elapsed)
 
 
 def still(time: float) -> float:
