@@ -61,7 +61,7 @@ class WholeLifts(LiftPayload):
     """Payload by the validator's rise and hold."""
 
     def payload(self, grasps: GraspSet, row: int) -> float:
-        self._weigh(self._own)
+        self._set_mass(self._own)
         if self._set_up_scene(grasps, row).outcome is not LiftOutcome.NOT_TRIED or not self._close(
             grasps, row, give_up=True
         ):
@@ -69,7 +69,7 @@ class WholeLifts(LiftPayload):
         self._save()
 
         def bears(mass: float) -> bool:
-            self._weigh(mass)
+            self._set_mass(mass)
             self._restore()
             self._goal = np.zeros(3)
             self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push_force * self._up
@@ -84,7 +84,7 @@ class WholePushes(PushPayload):
     """Payload by the validator's pushes."""
 
     def payload(self, grasps: GraspSet, row: int) -> float:
-        self._weigh(self._own)
+        self._set_mass(self._own)
         if self._set_up_test(grasps, row).outcomes[0] is Outcome.PENETRATION or not self._close(
             grasps, row, give_up=True
         ):
@@ -92,7 +92,7 @@ class WholePushes(PushPayload):
         self._save()
 
         def bears(mass: float) -> bool:
-            self._weigh(mass)
+            self._set_mass(mass)
             for direction in range(len(DIRECTIONS)):
                 self._restore()
                 self._push(direction)
