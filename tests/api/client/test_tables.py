@@ -31,7 +31,7 @@ CREATED = "2026-11-26T03:14:11.123456Z"
 _DONE = {"state": State.SUCCEEDED, "progress": 1.0, "created": CREATED, "model_dump": dict}
 _JOB = {"id": ID + "0" * 20, "hand": NAME, "object": NAME, "standing": "valid"}
 JOB = SimpleNamespace(**dict.fromkeys(("valid", "grasps", "requested"), 100_000), **_JOB, **_DONE)
-_DATASET = {"name": NAME, "cells": 1000, "counted": 10**6, "asked": 10**6, "size_bytes": 10**9 + 1}
+_DATASET = {"name": NAME, "cells": 1000, "counted_grasps": 10**6, "asked": 10**6, "size_bytes": 10**9 + 1}
 DATASET = SimpleNamespace(**_DATASET, **_DONE, options=JobOptions())
 _UPLOAD = {"name": NAME, "filename": NAME, "size_bytes": 10**6, "builtin": False, "verdict": "ok", "facts": {}}
 ASSET = SimpleNamespace(**_UPLOAD, digest=ID + "0" * 52, model_dump=dict)
