@@ -32,7 +32,7 @@ POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Values of column `scene_kind` that `read` supports.
 FREE: Final = "free"
 TABLE: Final = "table"
-#: Columns of grasps, with the names of their types in `parquet.type_of`.
+#: Columns of grasps, with the names of their types in `parquet.arrow_type`.
 GRASPS: Final = {
     "hand": "text",
     "object": "text",

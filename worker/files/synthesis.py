@@ -65,7 +65,7 @@ class SynthesisResult:
     place: SceneSpec
     interrupted: bool  # whether it was stopped early
     seconds: float  # wall time without loading of the files [s]
-    rolling: int = 0  # scenes in which the object may roll, see `rolling_poses`
+    rolling: int = 0  # scenes in which the object may roll, see `count_rolling_poses`
 
     @property
     def reason(self) -> str | None:
@@ -201,7 +201,7 @@ def synthesize_grasps(
 ) -> SynthesisResult:
     """Make the grasps of a job in scene `place`; `hand` and `obj` are files or built-in names.
     `mesh` has options for the object's file. `join` batches are one launch of the planner; None fills a GPU.
-    `processes` validate and measure: 1 is this process alone, 0 stands for `processes_at_once`. Raises InputError: an
+    `processes` validate and measure: 1 is this process alone, 0 stands for `pool_process_count`. Raises InputError: an
     invalid argument, or a scene without space. TaskCancelled: cancelled; with `partial`, only before any validation."""
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
     if request.shake and place.kind == "free":

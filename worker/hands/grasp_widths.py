@@ -63,7 +63,7 @@ def postures_for_size(hand: HandModel, size: Size) -> PinchPostures:
 
 
 def largest_width(hand: HandModel) -> float:
-    """Return an upper bound of the widths in `postures_for_size` [m], from `oppositions_of` alone."""
+    """Return an upper bound of the widths in `postures_for_size` [m], from `pinch_postures_of` alone."""
     return WIDER * pinch_postures_of(hand).widest + GOOD_M
 
 

@@ -119,7 +119,7 @@ class HandModel:
 
     @cached_property
     def content(self) -> str:
-        """Digest of all fields that `content_of` includes; `digest` is the digest of the source files."""
+        """Digest of all fields that `content_digest` includes; `digest` is the digest of the source files."""
         return content_digest(self)
 
     @cached_property

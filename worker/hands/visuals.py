@@ -161,7 +161,7 @@ def _file_of(item: PlacedShape, files: Mapping[str, bytes], base: str) -> str:
 
 
 def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
-    """Return the name in `files` of a mesh that a URDF references; see `read_reference`.
+    """Return the name in `files` of a mesh that a URDF references; see `resolve_mesh_reference`.
     Without an exact match, return the only file whose path has the same end, else one whose path differs in case.
     Raises HandError: the mesh is missing, or lies outside the upload."""
     try:
