@@ -71,7 +71,7 @@ def frame_along(z: Floats) -> Floats:
 
 
 def create_grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object]) -> GraspSet:
-    """Return hands as grasps with pregrasp and squeeze; `began` is the planner's start by `time.perf_counter` [s]."""
+    """Return hands as grasps with pregrasp and squeeze; `began` is the start by `time.perf_counter` [s]."""
     hand, obj, device = pair.hand.model, pair.fine.obj.model, pair.hand.device
     seconds = time.perf_counter() - began
     grasp = posture_of(hand, obj, state)
@@ -86,7 +86,7 @@ STEP: Final = 1e-4
 
 
 def inner_side_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoints:
-    """Spread points evenly on the surfaces that close: at most `each` per closing link, `on_palm` on the palm."""
+    """Spread points evenly on closing surfaces: at most `each` per closing link, `on_palm` on the palm."""
     points = sample_surface(hand, SAMPLES)
     inside = _inner_side_mask(hand, points)
     chosen: list[NDArray[np.intp]] = []

@@ -222,7 +222,7 @@ class HandMapping:
 
 
 def load_mapping(file: Path) -> HandMapping | None:
-    """Load the mapping of a grasp file's experiment; None if there is none. Raises InputError: it is invalid."""
+    """Load the mapping of a grasp file's experiment, or None. Raises InputError: it is invalid."""
     for above in file.resolve().parents:
         if above.name in _FOLDERS:
             return _read_mapping(above.parent / FILE)

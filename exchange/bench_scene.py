@@ -101,7 +101,7 @@ def check_table(placed: PlacedGrasps) -> None:
 
 
 def tabletop_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats) -> Row:
-    """Return the fields for hands on arms of a grasp whose object is at `pose` (7,); the evaluator ignores them.
+    """Return fields for hands on arms, with the object at `pose` (7,); the evaluator ignores them.
     `approach_qpos` (W, 7 + J) is the open hand from standoff to pregrasp, `lift_qpos` (7 + J,) the raised squeeze."""
     assert grasps.approach is not None and grasps.coming is not None and grasps.lift is not None
     way = compose(pose, grasps.approach[row])
@@ -145,7 +145,7 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
 def add_trajectory(
     hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> GraspSet:
-    """Add approach and lift (object frame) if all approaches have the same number of waypoints and fixed joints."""
+    """Add approach and lift (object frame) if all approaches have as many waypoints and fixed joints."""
     if not all({"approach_qpos", "lift_qpos"} <= set(row) for row in rows):
         return grasps
     ways = [np.asarray(row["approach_qpos"], float) for row in rows]

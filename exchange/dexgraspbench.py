@@ -69,7 +69,7 @@ def write(
     folder: Path,
     placed: PlacedGrasps | None = None,
 ) -> list[Path]:
-    """Write grasps and all files that DexGraspBench's evaluator needs; return the first experiment's grasp files.
+    """Write grasps and all files for DexGraspBench's evaluator; return the first experiment's grasp files.
     The object is at the origin or, for `placed` grasps, on its table. Each of `write_models` gets an experiment. Raises
     InputError: the scenes are no tables."""
     if placed is not None:

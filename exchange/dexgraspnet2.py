@@ -91,7 +91,7 @@ class SceneGraspness:
     def picture_graspness(
         self, depth: Floats, labels: NDArray[np.uint8], intrinsics: Floats, camera: Floats, object_pose: Floats
     ) -> NDArray[np.float32]:
-        """Return the graspness (N, 1) of a picture's points, as the loader makes and orders them; 0 on neighbours.
+        """Return the graspness (N, 1) of a picture's points in the loader's order; 0 on neighbours.
         `depth` (H, W) [m] is 0 without a surface. `labels` (H, W) are 0 for background and 1 for the grasps' object; at
         least one is not 0. `intrinsics` are (3, 3) [px]. `camera` (4, 4) and `object_pose` (7,): table's frame."""
         cloud = back_project(depth, intrinsics)
@@ -106,7 +106,7 @@ class SceneGraspness:
 
 
 def lines_of_sight(hand: HandModel, grasps: Posture) -> tuple[Floats, Floats]:
-    """Return origins (K, 3) [m] and unit directions (K, 3) of the lines from palm to middle of thumb and fingers.
+    """Return origins and unit directions (K, 3) of the lines from palm to middle of thumb and fingers [m].
     The thumb is the fingertip farthest from the other fingertips of the open hand. With one fingertip, or fingers that
     meet in the palm, the line is the approach."""
     palm = apply(grasps.hand_pose, hand.palm.centre)
@@ -161,7 +161,7 @@ def back_project(depth: Floats, intrinsics: Floats) -> Floats:
 
 
 def workspace_mask(cloud: Floats, depth: Floats, labels: NDArray[np.uint8], camera: Floats) -> NDArray[np.bool_]:
-    """Return a mask (H, W) of pixels whose points (H, W, 3) the loader keeps: near the box around labelled points.
+    """Return a mask (H, W) of pixels that the loader keeps: points near the box around labelled points.
     The box is in the table's frame. As in the loader, labelled pixels without depth extend it to the camera."""
     whole = np.concatenate([cloud.reshape(-1, 3), np.ones((depth.size, 1))], axis=1)
     there = np.einsum("ab,nb->na", camera, whole)[:, :3]
@@ -193,7 +193,7 @@ _MEMBERS: Final = 1024  # largest number of arrays in an `.npz` file
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: Noise = None
 ) -> ExportSummary:
-    """Write each scene with pictures and grasps. Raises InputError: there is none, or too many for the format."""
+    """Write each scene with pictures and grasps. Raises InputError: no scene, or too many for the format."""
     top = folder / "data"
     if top.exists():
         raise InputError(f"{top} exists already; give another folder as --output")

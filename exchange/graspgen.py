@@ -44,7 +44,7 @@ _AT_ONCE: Final = 256  # number of hands in a batch of closing
 
 
 def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write all validated grasps, failed ones included, in a folder per hand; `valid.txt` has held-out objects."""
+    """Write all validated grasps, also failed ones, by hand; `valid.txt` has held-out objects."""
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds grasps already; give another folder as --output")
     done = ExportSummary({"grasps": 0, "good": 0, "objects": 0, "files": 0})

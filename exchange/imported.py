@@ -123,7 +123,7 @@ class _SafeUnpickler(pickle.Unpickler):
 
 
 def load_npy(path: Path) -> Any:
-    """Load a `.npy` file: an array, or its only object. Raises InputError: it is invalid, or would run code."""
+    """Load a `.npy` file: an array, or its only object. Raises InputError: it is invalid or runs code."""
     try:
         with path.open("rb") as file:
             try:

@@ -44,7 +44,7 @@ class ExportPart:
 
 
 def held_out_objects(kinds: Mapping[str, str], share: float) -> frozenset[str]:
-    """Return the objects of a share of the families; `kinds` has each object's family, and a hash selects families.
+    """Return the objects of a share of the families, selected by hash; `kinds` has each object's family.
     At least one family is held out and at least one is not; a single family is not held out."""
     order = sorted(set(kinds.values()), key=lambda kind: hashlib.sha256(kind.encode()).digest())
     chosen = order[: min(max(1, round(share * len(order))), len(order) - 1)]

@@ -46,7 +46,7 @@ def write(views: Shard, folder: Path) -> list[Path]:
 
 
 def box_3d(corners: Floats, extrinsics: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return least and greatest corner (3,) of a box in its own centred frame, and this frame's pose (4, 4).
+    """Return least and greatest corner (3,) of a box in its centred frame, and this frame's pose (4, 4).
     The pose, in the world, acts on row vectors. `corners` (8, 3) are in the camera frame. Corner k has the greatest x,
     y, z along the box's axes if bit 0, 1, 2 of k is set."""
     world = (corners - extrinsics[:3, 3]) @ extrinsics[:3, :3]

@@ -1,4 +1,4 @@
-"""Root of the command line; it lists the commands of all packages, and imports a module on its first use."""
+"""Root of the command line; lists the commands of all packages, imports a module on its first use."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def data_frame_of(grasps: Grasps) -> Any:
 
 
 def grasps_html(grasps: Grasps) -> str:
-    """Return `repr` and a picture of the best grasps as HTML, or a table of their metrics without a picture."""
+    """Return `repr` and a picture of the best grasps as HTML, or without a picture a table of metrics."""
     head = f"<p>{escape(repr(grasps))}</p>"
     try:
         png = sheet_png(grasps, PICTURED, EDGE, PICTURE_S)

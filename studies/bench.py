@@ -1,4 +1,4 @@
-"""Planner throughput by fidelity, batch and threads, with times of kernels and of the host: table, JSON, plot."""
+"""Planner throughput by fidelity, batch and threads, with kernel and host times: table, JSON, plot."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ SAMPLED: Final = 12  # number of iterations that are timed launch by launch, in 
 
 
 def kernel_shares(pair: Pair, fidelity: Fidelity, count: int) -> dict[str, Any]:
-    """Return time per iteration [ms], shares of kernels and queries per second of each phase, for `count` grasps."""
+    """Return time per iteration [ms], kernel shares and queries per second by phase, for `count` grasps."""
     state = sample_starts(pair.model(pair.coarse), seed=0, batch=0, indices=range(count), each=1)
     phases: dict[str, Any] = {}
     for name, side, schedule in (
@@ -190,7 +190,7 @@ def _time_kernels(
 
 
 def measure_host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
-    """Return host time per candidate [ms]: time of one CPU thread outside the planner's kernels, with full caches."""
+    """Return host time per candidate [ms]: one CPU thread outside the planner's kernels, with full caches."""
     run = ExecutionContext("cpu", threads=1)
     plan(hand, obj, PlanRequest(count, fidelity, seed=1), run)
     with kernel_seconds() as elsewhere:
@@ -206,7 +206,7 @@ def device_name(device: str) -> str:
 
 
 def clock_of(device: str) -> Callable[[], float]:
-    """Return a clock: core-seconds of all threads on a CPU, where other load hardly matters; wall clock on a GPU."""
+    """Return a clock: core-seconds of all threads on a CPU (robust to other load); wall clock on a GPU."""
     return time.process_time if device == "cpu" else time.perf_counter
 
 

@@ -57,7 +57,7 @@ def minute_plot(values: Sequence[int], start: float) -> Plot:
 
 
 def histogram_bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
-    """Return a histogram's bars; each links to page `path` with the grasps in its range that match `where`."""
+    """Return a histogram's bars; each links to page `path` with the grasps in its range and in `where`."""
     width, top = (histogram.high - histogram.low) / len(histogram.counts), max(histogram.counts) or 1
     made = []
     for index, number in enumerate(histogram.counts):

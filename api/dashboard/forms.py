@@ -1,4 +1,4 @@
-"""Form of a job without JavaScript, with its estimated cost; submission, cancellation and retry of jobs."""
+"""Form of a job without JavaScript, with its cost; submission, cancellation and retry of jobs."""
 
 from __future__ import annotations
 

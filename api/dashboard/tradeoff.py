@@ -208,7 +208,7 @@ def _mean_point(runs: list[ChartRun], axis: str, scale: float, names: list[str])
 
 
 def _mean_speed(runs: Sequence[ChartRun]) -> float:
-    """Return the number of grasps per second of total time; in charts of graspd 0.1, the geometric mean speed."""
+    """Return grasps per second of total time; in charts of graspd 0.1, the geometric mean speed."""
     if all(run.grasp_count is not None for run in runs) and (seconds := sum(run.seconds for run in runs)):
         return sum(run.grasp_count or 0 for run in runs) / seconds
     speeds = [run.valid_per_second for run in runs if run.valid_per_second]

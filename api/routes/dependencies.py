@@ -166,7 +166,7 @@ _TAGS: Final = re.compile(r'\s*((?:W/)?"[^"]*")\s*(?:,|$)')
 
 
 def is_unmodified(headers: Headers, etag: str) -> bool:
-    """Check whether If-None-Match is * or has the file's tag (weak comparison), so that the response is 304."""
+    """Check whether If-None-Match is * or has the file's tag (weak comparison): the response is 304."""
     given = headers.getlist("if-none-match")
     tags = {tag.removeprefix("W/") for value in given for tag in _TAGS.findall(value)}
     return etag in tags or any(value.strip() == "*" for value in given)

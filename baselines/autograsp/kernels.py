@@ -67,7 +67,7 @@ def object_to_pieces(
     # Data out:
     near_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Take samples of the object within `margin` into account, which include its edges. Launch over (B, P)."""
+    """Take samples of the object within `margin` into account, also on its edges. Launch over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return
@@ -98,7 +98,7 @@ def bodies_to_pieces(
     # Data out:
     pair_inout: wp.array3d(dtype=wp.float32),
 ):
-    """Compute the least distance of each body's points to bodies that must not touch it. Launch over (B, P)."""
+    """Compute the least distance of a body's points to bodies that must not touch it. Launch over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return
@@ -150,7 +150,7 @@ def close(
     stopped_inout: wp.array2d(dtype=wp.int32),
     q_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Stop dofs that move a touching body; close the others by a step that skips no contact. Launch over B.
+    """Stop dofs that move a touching body; close others by a step that skips no contact. Launch over B.
     A point of body a moves by at most the sum of lever[d, a] |dq_d| over the closing dofs d. All dofs of a finger have
     the same step, share * gap / sum lever (conservative advancement)."""
     b = wp.tid()

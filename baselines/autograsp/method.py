@@ -168,7 +168,7 @@ class HandCloser:
         return data.state(n)
 
     def _measure(self, *, fingers: bool = False) -> None:
-        """Compute distances of the bodies from the object, and with `fingers` from each other, up to `REACH_M`."""
+        """Compute distances of bodies from the object, and with `fingers` from each other, up to `REACH_M`."""
         m, d = self.model, self.data
         self._poses.run()
         posed = [d.active, d.body_p, d.body_q]

@@ -275,7 +275,7 @@ def accept(
     contact_inout: wp.array2d(dtype=wp.int32),
     taken_inout: wp.array(dtype=wp.int32),
 ):
-    """Accept or reject the proposals; the first has no rival, as the old energy is infinite. Launch over B."""
+    """Accept or reject the proposals; the first is accepted: the old energy is infinite. Launch over B."""
     b = wp.tid()
     rng = rng_inout[b]
     uniform = wp.randf(rng)

@@ -49,7 +49,7 @@ class Search:
         self.points = sample_surface(pair.hand.model, POINTS)
 
     def run(self, starts: HandState, *, steps: int, tell: StepCounter) -> tuple[HandState, Floats]:
-        """Return hands after `steps` iterations, and their `residual` (n,). Raises TaskCancelled: through `tell`."""
+        """Return hands after `steps` iterations, and their `residual` (n,). Raises TaskCancelled by `tell`."""
         n = len(starts.pivot)
         back = quat_rotate(starts.rotation, self.pair.hand.model.palm.approach)
         batch = _Batch(self, replace(starts, pivot=starts.pivot - BACKOFF_M * back), steps)

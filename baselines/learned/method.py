@@ -84,7 +84,7 @@ Generators = list[np.random.Generator]
 
 @dataclass(frozen=True)
 class NetworkStarts:
-    """A `WarmStart` from a network's proposals; starts of fast_graspd replace those without a free proposal."""
+    """A `WarmStart` from a network's proposals; starts of fast_graspd replace those that collide."""
 
     network: ProposalNetwork
     starts: int  # starts per grasp
@@ -145,7 +145,7 @@ def table_height(supports: Sequence[Obstacle]) -> float:
 def _retreat_until_clear(
     model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: PlacedGrasps
 ) -> tuple[HandState, Floats]:
-    """Return for each of n starts the free hand that retreats least, and its depth [m], inf if none is free.
+    """Return for each of n starts the free hand that retreats least, and its depth [m]; inf: none is free.
     Hands without clearance from obstacles are first moved up."""
     count, probe = len(scene), Probe(model, len(scene), room=ROOM)
     draws = len(drawn.pivot) // count
@@ -218,7 +218,7 @@ class SurfaceView:
         return np.asarray(self._object_centre(pose) + distance * toward)
 
     def cloud(self, pose: Floats, camera: Floats, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Sample (count, 3) points [m] and normals among pixels' nearest points, with the object at `pose` (7,)."""
+        """Sample (count, 3) points [m] and normals among pixels' nearest points; object at `pose` (7,)."""
         points, normals = quat_rotate(pose[3:], self.points) + pose[:3], quat_rotate(pose[3:], self.normals)
         rays = points - camera
         facing = np.flatnonzero((normals * rays).sum(axis=1) < 0)

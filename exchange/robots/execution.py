@@ -137,8 +137,8 @@ def parse_pose(text: str, what: str) -> Floats:
 
 
 def tool_frame(text: str | None, root_link: str, links: Mapping[str, tuple[int, Floats]]) -> ToolFrame:
-    """Return the tool frame `text`: a link that no finger moves, or a pose in the root link's frame; default: root.
-    `links` has body and pose of each link, see `Description`. Raises InputError: `text` is neither."""
+    """Return the tool frame: a link that no finger moves, or a pose in the root's frame; default: root.
+    `links` has body and pose of each link, see `HandDescription`. Raises InputError: `text` is neither."""
     if not text or text == root_link:
         return ToolFrame(root_link, IDENTITY_POSE.copy())
     if text in links:

@@ -108,7 +108,7 @@ def add_appearance(tree: Element, found: Executions, names: tuple[str, ...]) -> 
 
 
 def _key_frame(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, str]:
-    """Return state and targets of a key frame; the fingers' state in squeeze and lift is that of the grasp."""
+    """Return state and targets of a key frame; fingers in squeeze and lift have the grasp's state."""
     command = found.postures[posture]
     stands = found.postures["grasp"] if posture in ("squeeze", "lift") else command
     pose = command.hand_pose[row]

@@ -73,7 +73,7 @@ class Solid:
 
 
 def hand_meshes(found: Executions) -> list[Solid]:
-    """Return the hand's visible meshes in their bodies' frames; a body's second and further meshes are numbered."""
+    """Return the hand's visible meshes in their bodies' frames; further meshes of a body are numbered."""
     bodies, made = drawn_bodies(found.hand), []
     for number, part in enumerate(hand_parts(found.hand)):
         before = bodies[:number].count(bodies[number])

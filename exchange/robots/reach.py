@@ -288,7 +288,7 @@ class ArmScene:
         self.hand_qpos = _joint_addresses(self.model, hand, "hand")
 
     def first_collision(self, arm_joints: Floats, hand_joints: Floats, object_pose: Floats) -> str:
-        """Return a colliding pair at arm dofs (A,), hand joints (J,) and object pose (7,); empty if there is none."""
+        """Return a colliding pair at arm dofs (A,), hand joints (J,) and object pose (7,); empty: none."""
         self._put(self.model, self.data, arm_joints, hand_joints)
         self.data.mocap_pos[0], self.data.mocap_quat[0] = object_pose[:3], object_pose[3:]
         mujoco.mj_kinematics(self.model, self.data)

@@ -99,7 +99,7 @@ def evaluate_command(
 
 
 def _validate_level(protocol: str, level: str) -> str:
-    """Return the level, or the protocol's default if empty; raise InputError if protocol or level is unknown."""
+    """Return the level, or the protocol's default if empty; InputError if protocol or level is unknown."""
     if protocol not in get_args(Protocol):
         raise InputError(f"unknown protocol {protocol!r}; choose {choices_text(protocol, get_args(Protocol))}")
     levels = get_args(LiftLevel if protocol == "lift" else Level)

@@ -359,7 +359,7 @@ class JobOptions(Model):
 
     @property
     def displayed_status(self) -> Literal["valid", "feasible", "kept"]:
-        """Status of the grasps that tables count: `counted_status`, or all stored ones for unvalidated candidates."""
+        """Status of the grasps that tables count: `counted_status`; for unvalidated candidates all stored."""
         return "kept" if self.counted_status == "feasible" and self.want == "candidates" else self.counted_status
 
     def rechecks_of(self, batch: int) -> int:

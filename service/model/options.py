@@ -1,4 +1,4 @@
-"""Tables of options: command line, dashboard forms, Python signatures and docs derive from `option_rows`."""
+"""Tables of options: command line, forms, Python signatures and docs derive from `option_rows`."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def _plot_qualities(card: Row, tally: Tally) -> Any:
 
 
 def _plot_directions(card: Row, tally: Tally) -> Any:
-    """Plot directions of palms: in the object's frame (top row) and by elevation over the table (bottom row)."""
+    """Plot directions of palms: in the object's frame (top row), by elevation over the table (bottom row)."""
     hands = [hand for hand in _names(card, "hands") if card["directions"]["by_hand"][hand]][:_PANELS]
     if not hands:
         return None

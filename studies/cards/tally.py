@@ -52,7 +52,7 @@ class JointUse:
             self.counts[row] += np.bincount(places, minlength=BINS)
 
     def shares(self) -> dict[str, dict[str, float]]:
-        """Return percentiles of each joint, the range `used` from the 1st to the 99th, and shares at its limits."""
+        """Return percentiles of each joint, the range `used` (1st to 99th), and shares at its limits."""
         found = {}
         near = max(1, round(_AT * BINS))
         for name, counts in zip(self.names, self.counts, strict=True):
@@ -266,7 +266,7 @@ ELEVATION_BINS: Final = 36  # number of bins of elevations from -90 to 90 degree
 
 
 def cell_counts(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
-    """Return (bands, sectors) counts of unit vectors (N, 3), from the lowest band and azimuth -180 degrees on."""
+    """Return (bands, sectors) counts of unit vectors (N, 3), from the lowest band and azimuth -180°."""
     cells = direction_cells(np.asarray(directions).reshape(-1, 3), bands, sectors)
     return np.bincount(cells, minlength=bands * sectors).reshape(bands, sectors)
 

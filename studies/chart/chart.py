@@ -117,7 +117,7 @@ def settings_of(
     quick: bool,
     run: ExecutionContext,
 ) -> list[Setting]:
-    """Return a setting for each fidelity and batch of each method, and one for a method without fidelities.
+    """Return a setting for each fidelity and batch of each method; one for a method without fidelities.
     The latter has `batches[0]` grasps per call, or `baseline_batch` if it has an option `steps`, because such grasps
     take seconds each. Raises InputError: a method or an option is unknown."""
     variants = [_parse_method(text) for text in methods]

@@ -112,7 +112,7 @@ def _draw_over_speed(
 
 
 def draw_scenes(rows: Rows, files: Sequence[Path], *, second: str) -> None:
-    """Plot shares of candidates over lifted grasps per `second` (the unit of time), and over time to the first."""
+    """Plot shares of candidates over lifted grasps per `second` (time unit), and over time to the first."""
     figure = new_figure(15.5, 8.6)
     panels = figure.subplots(2, 3)
     styles = _styles(rows)

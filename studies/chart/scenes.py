@@ -208,7 +208,7 @@ class ValidatedGrasps:
 
 
 def lift_figures(rows: Sequence[Mapping[str, Any]]) -> Row:
-    """Return shares of all candidates with 95 % intervals (Wilson), lifted grasps per second, and robust share.
+    """Return shares of candidates with 95 % intervals (Wilson), lifted grasps per second, robust share.
     All grasps have equal weight; refused cells have no time."""
     grasps = sum(row["grasps"] for row in rows)
     found: Row = {"grasps": grasps}

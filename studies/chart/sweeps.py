@@ -98,7 +98,7 @@ def sweep_settings(
     knobs: Sequence[str],
     say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
-    """Return a row per setting (`knob`) and value, with its `speedup` over the default and a run's figures.
+    """Return a row per setting (`knob`) and value: `speedup` over the default and a run's figures.
     Values are interleaved, repeat by repeat. Times are those of `clock_of`."""
     wp.load_module(module=kernels, device=run.device)
     default = KnobValue("", "default")

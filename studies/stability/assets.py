@@ -146,7 +146,7 @@ def prepare_mesh(mesh: Any, face_error_m: float, *, allow_open: bool = False) ->
 def shape_cell(
     hand: HandModel, place: Place, mesh: Any, options: MapOptions, *, allow_open: bool = False, **asked: Any
 ) -> MapCell:
-    """Return the share of valid candidates of a hand on a mesh in metres; `asked` is the job's fidelity or method."""
+    """Return the share of valid candidates of a hand on a mesh [m]; `asked`: the job's fidelity or method."""
     request = JobRequest(hand="hand", object="shape", grasps=options.count, want="candidates", rechecks=0, **asked)
     try:
         obj = prepare_mesh(mesh, request.resolved_fidelity.face_error_m, allow_open=allow_open)

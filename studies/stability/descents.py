@@ -1,4 +1,4 @@
-"""Stress tests of the planner's descent: displaced starts, extreme rates and weights, 100,000 iterations."""
+"""Stress tests of the descent: displaced starts, extreme rates and weights, 100,000 iterations."""
 
 from __future__ import annotations
 

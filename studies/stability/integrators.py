@@ -120,7 +120,7 @@ def _penalty(contacts: Contacts, v: Floats, w: Floats, stiffness: float) -> tupl
 
 
 def _largest_depth(points: Floats, centre: Floats) -> float:
-    """Return the depth of the deepest cage point in the ball [m]; its diameter if the ball has left the cage."""
+    """Return the depth of the deepest cage point in the ball [m]; its diameter if the ball left the cage."""
     if float(np.linalg.norm(centre)) > 2 * RADIUS_M:
         return 2 * RADIUS_M
     return max(0.0, RADIUS_M - float(np.linalg.norm(points - centre, axis=1).min()))

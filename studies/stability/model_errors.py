@@ -103,7 +103,7 @@ ERRORS: Final[dict[str, _Error]] = {
 def model_error_map(
     hands: Sequence[HandModel], obj: ObjectModel, options: MapOptions, *, errors: Sequence[str] = (), every: int
 ) -> StabilityMap:
-    """Map the share of valid grasps that hold despite one of `errors` (default: all), each n-th (`every`) amount."""
+    """Map the share of valid grasps that hold despite each of `errors` (default: all), every n-th amount."""
     cells = [cell for hand in hands for cell in _cells(hand, obj, options, errors or tuple(ERRORS), every)]
     return StabilityMap(
         "model_errors",

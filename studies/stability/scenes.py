@@ -1,4 +1,4 @@
-"""Difficult scenes: flat and tall objects on a table, walls and neighbours, too small or large objects."""
+"""Difficult scenes: flat and tall objects on a table, walls, neighbours, too small or large objects."""
 
 from __future__ import annotations
 

@@ -148,7 +148,7 @@ def _resolve_drive(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping
 
 
 def _fold_limits(dof: str, moving: dict[str, Mimic], robot: Robot, options: HandOptions) -> tuple[float, float]:
-    """Return a dof's range in which all its followers stay within their own limits; see `_has_binding_limits`."""
+    """Return a dof's range in which all followers stay within their limits; see `_has_binding_limits`."""
     lower, upper = -math.inf, math.inf
     narrowest = dof
     for name, drive in moving.items():
