@@ -19,11 +19,11 @@ from graspd.api.dashboard.rendering import STATIC, problem_page
 from graspd.api.formatting import is_loopback
 from graspd.api.metrics import Metrics
 from graspd.api.middleware.limits import BodyLimit, RateLimit, Rates
-from graspd.api.middleware.request_context import Head, RequestContext, RootPath, SameOrigin, host_name
+from graspd.api.middleware.request_context import HeadMethod, RequestContext, RootPath, SameOrigin, host_name
 from graspd.api.routes import assets, datasets, grasps, jobs, system
 from graspd.api.routes.assets import asset_router
-from graspd.api.routes.dependencies import EXPORTS, FORMS, UPLOADS, RequestLimiter, provide
-from graspd.service.index.rebuild import complete_if_new
+from graspd.api.routes.dependencies import EXPORTS, FORMS, UPLOADS, RequestLimiter, install_services
+from graspd.service.index.rebuild import mark_complete_if_new
 from graspd.service.model.errors import InputError, UnavailableError
 from graspd.service.model.states import AssetKind
 from graspd.service.model.version import PACKAGE_VERSION
@@ -59,7 +59,7 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     if services is None:
         identify_if_redis_answers(opened)
     with suppress(UnavailableError):
-        complete_if_new(opened.index, opened.store)
+        mark_complete_if_new(opened.index, opened.store)
     rates = Rates(redis_url(settings))
 
     @asynccontextmanager
@@ -81,10 +81,10 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     )
     app.state.settings = settings
     app.state.keys, app.state.proxy, app.state.metrics = keys, proxy, Metrics()
-    provide(app, opened)
+    install_services(app, opened)
     app.state.uploads, app.state.forms, app.state.exports = map(RequestLimiter, (UPLOADS, FORMS, EXPORTS))
     problems.install_handlers(app, problem_page)
-    pages.install(app, opened)
+    pages.install_dashboard(app, opened)
     for router in (*_ROUTERS, *map(asset_router, AssetKind), *datasets.routers, *pages.routers):
         # Adds the routes built at import. `include_router` would rebuild them at the first request. It would also
         # silence warnings for the whole process, which is unsafe while another application is built.
@@ -97,7 +97,7 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Proxy, rates: Rates) -> None:
     """Add middleware, innermost first."""
-    app.add_middleware(Head)
+    app.add_middleware(HeadMethod)
     uploads = frozenset({*(f"/v1/{kind.value}s" for kind in AssetKind), "/submit"})
     app.add_middleware(BodyLimit, upload_paths=uploads, upload_bytes=settings.max_upload_bytes)
     app.add_middleware(RateLimit, keys=keys, proxy=proxy, settings=settings, rates=rates)

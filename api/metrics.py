@@ -31,13 +31,13 @@ class Metrics:
         self._requests.labels(method, route, str(status)).inc()
         self._seconds.labels(method, route).observe(seconds)
 
-    def render(self, service: Snapshot) -> bytes:
+    def render(self, service: MetricsSnapshot) -> bytes:
         snapshot = CollectorRegistry()
         snapshot.register(service)
         return generate_latest(self.registry) + generate_latest(snapshot)
 
 
-class Snapshot:
+class MetricsSnapshot:
     """State of the service at a scrape. Series of parts that do not answer are omitted."""
 
     def __init__(self) -> None:
@@ -81,13 +81,13 @@ class Snapshot:
             for labels, value in samples.items():
                 family.add_metric(labels, value)
             yield family
-        yield from _families(self._sums)
+        yield from _metric_families(self._sums)
 
     def _set(self, name: str, *labels: object, value: float) -> None:
         self._values[name][tuple(map(str, labels))] = value
 
 
-def _families(sums: Mapping[str, float]) -> Iterable[Metric]:
+def _metric_families(sums: Mapping[str, float]) -> Iterable[Metric]:
     """Yield counters and histograms of the controller; fields without a known series are omitted."""
     found: Values = defaultdict(dict)
     for text, amount in sums.items():

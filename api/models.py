@@ -11,7 +11,7 @@ from graspd.service.model.base import Digest, TagName
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.metric_fields import OfferedName, filter_fields, insert_fields, mean_fields
 from graspd.service.model.metrics import AXIS_WORDS, DIRECTION_CELLS
-from graspd.service.model.records import Choice
+from graspd.service.model.records import FidelityChoice
 from graspd.service.model.scene_spec import Box, HalfSpace, SceneKind
 from graspd.service.model.states import Stage, State
 from graspd.service.model.where import LONGEST
@@ -83,7 +83,7 @@ class JobDetail(Job):
     request: JobRequest
     hand_digest: str
     object_digest: str
-    choice: Choice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
+    choice: FidelityChoice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
     note: str | None = Field(None, description="why fewer grasps than requested were found; null if enough")
     outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome, if the job found too few grasps")
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")

@@ -98,11 +98,11 @@ def problem_response(
     return JSONResponse(content, status_code=status, media_type=MEDIA_TYPE, headers=headers)
 
 
-def describe(error: Exception) -> tuple[str, str, int, str]:
+def describe_error(error: Exception) -> tuple[str, str, int, str]:
     """Return (slug, title, status, detail) of an exception; unexpected errors reveal no internals."""
     if isinstance(error, GraspdError):
         return error.slug, error.title, error.status, replace_surrogates(str(error)) or error.title
-    if _is_full(error) or _is_full(error.__cause__):
+    if _is_disk_full(error) or _is_disk_full(error.__cause__):
         return StoreUnavailable.slug, StoreUnavailable.title, StoreUnavailable.status, _FULL_SAID
     if isinstance(error, ApiError):
         status, detail = error.status, str(error)
@@ -114,7 +114,7 @@ def describe(error: Exception) -> tuple[str, str, int, str]:
     return HTTP_SLUGS.get(status, "internal"), HTTPStatus(status).phrase, status, detail
 
 
-def _is_full(error: BaseException | None) -> bool:
+def _is_disk_full(error: BaseException | None) -> bool:
     """Check whether the disk was full; FastAPI hides this cause behind a bad request."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
@@ -125,7 +125,7 @@ def replace_surrogates(text: str) -> str:
 
 
 def error_response(request: Request, error: Exception) -> JSONResponse:
-    slug, title, status, detail = describe(error)
+    slug, title, status, detail = describe_error(error)
     headers = dict(getattr(error, "headers", None) or {})
     if isinstance(error, HTTPException) and status == 404:
         detail = f"there is no {request.url.path}"
@@ -185,7 +185,7 @@ def install_handlers(app: FastAPI, page: Callable[[Request, dict[str, Any]], Res
     def answer_any(request: Request, error: Exception) -> Response:
         is_api = request.url.path.startswith(("/v1/", "/healthz", "/readyz", "/metrics", "/openapi.json"))
         if not is_api and "text/html" in request.headers.get("accept", ""):
-            slug, title, status, detail = describe(error)
+            slug, title, status, detail = describe_error(error)
             facts = {"type": slug, "title": title, "status": status, "detail": detail}
             return page(request, facts | {"request_id": request_id_of(request)})
         return error_response(request, error)

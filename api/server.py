@@ -19,7 +19,7 @@ from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
 from graspd.api.app import create_app
-from graspd.service.run.address import bind
+from graspd.service.run.address import bind_socket
 from graspd.service.settings import Settings
 
 #: Longest wait of a stopping server for event streams [s], because only clients end them.
@@ -28,7 +28,7 @@ _TOO_SLOW: Final = b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nConten
 
 
 def serve(settings: Settings) -> None:
-    listener = bind(settings.host, settings.port)
+    listener = bind_socket(settings.host, settings.port)
     with listener:
         listener.listen(socket.SOMAXCONN)
         # Uploads are spooled in this folder, because /tmp may be in memory.

@@ -10,11 +10,11 @@ from pathlib import PurePosixPath
 from typing import IO, Final
 
 from graspd.service.model.errors import InputError, LimitError
-from graspd.service.model.names import check_length
+from graspd.service.model.names import check_name_length
 from graspd.service.model.states import AssetKind
 from graspd.service.store.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
-from graspd.service.store.descriptions import json_object
-from graspd.service.store.hand_files import SUFFIXES, hand_name, main_of
+from graspd.service.store.descriptions import parse_json_object
+from graspd.service.store.hand_files import SUFFIXES, find_main_file, hand_name
 from graspd.service.store.network_file import NETWORK_FILE, check_size
 
 MAIN_SUFFIXES: Final[dict[AssetKind, tuple[str, ...]]] = {
@@ -45,14 +45,14 @@ def files_of_upload(
         check_size(size, leaf)
         files: MutableMapping[str, bytes] = {NETWORK_FILE: file.read()}
     elif suffix == ".zip":
-        files = ZipFiles(file, limit_bytes=limit_bytes * UNPACK_FACTOR).without_common_folder()
+        files = ZipFiles(file, limit_bytes=limit_bytes * UNPACK_FACTOR).strip_common_folder()
     else:
         files = {check_path(leaf): file.read()}
     stated = "asset.json" in files
-    said = json_object(asset_json(files), "asset.json") if stated else {}
-    described = said | (json_object(options, "options") if options else {})
+    said = parse_json_object(asset_json(files), "asset.json") if stated else {}
+    described = said | (parse_json_object(options, "options") if options else {})
     if kind is AssetKind.HAND and isinstance(wanted := described.get("file", ""), str):
-        described["file"] = main_of(files, wanted, where=leaf)
+        described["file"] = find_main_file(files, wanted, where=leaf)
     elif not stated:
         described.setdefault("file", _main_file(kind, leaf, files))
     if described != said:
@@ -64,7 +64,7 @@ def name_of_upload(filename: str) -> str:
     """Derive a valid asset name: `My mug (2).stl` becomes `My-mug-2`; raise InputError if it is too long."""
     leaf = PurePosixPath(filename.replace("\\", "/")).name
     stem = hand_name(leaf) if leaf.lower().endswith(SUFFIXES) else PurePosixPath(leaf).stem
-    return check_length(_NAME.sub("-", stem).strip("-._") or "unnamed")
+    return check_name_length(_NAME.sub("-", stem).strip("-._") or "unnamed")
 
 
 def _main_file(kind: AssetKind, upload: str, files: Mapping[str, bytes]) -> str:

@@ -58,7 +58,7 @@ def load_pair(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleTy
     return pair
 
 
-def free_starts(pair: Pair, *, seed: int, batch: int, indices: range) -> HandState:
+def collision_free_starts(pair: Pair, *, seed: int, batch: int, indices: range) -> HandState:
     """Sample a collision-free start per grasp, with the palm towards a random surface point (Grasp'D)."""
     return sample_starts(pair.model(pair.coarse), seed=seed, batch=batch, indices=indices, each=1)
 
@@ -70,7 +70,7 @@ def frame_along(z: Floats) -> Floats:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object]) -> GraspSet:
+def create_grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object]) -> GraspSet:
     """Return hands as grasps with pregrasp and squeeze.
     `began` is the planner's start by `time.perf_counter` [s]."""
     hand, obj, device = pair.hand.model, pair.fine.obj.model, pair.hand.device
@@ -90,7 +90,7 @@ def inner_side_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoi
     """Spread points evenly on the surfaces that close.
     There are at most `each` points per closing link, and at most `on_palm` on the palm."""
     points = sample_surface(hand, SAMPLES)
-    inside = _inside(hand, points)
+    inside = _inner_side_mask(hand, points)
     chosen: list[NDArray[np.intp]] = []
     for body in range(hand.bodies):
         mine = np.flatnonzero((points.body == body) & inside)
@@ -101,7 +101,7 @@ def inner_side_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoi
     return SurfacePoints(points.body[index], points.position[index], points.normal[index], points.area[index])
 
 
-def _inside(hand: HandModel, points: SurfacePoints) -> NDArray[np.bool_]:
+def _inner_side_mask(hand: HandModel, points: SurfacePoints) -> NDArray[np.bool_]:
     before, after = (posed_points(hand, points, hand.preshape + t * hand.closing) for t in (0.0, STEP))
     motion = after[0] - before[0]
     speed = np.linalg.norm(motion, axis=1)

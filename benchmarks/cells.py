@@ -28,7 +28,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.port import PlanRequest
-from graspd.worker.scenes.rollout import rollout_on
+from graspd.worker.scenes.rollout import create_rollout
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.validator import validate
@@ -120,7 +120,7 @@ class Cell:
 def planned(hand: HandModel, obj: ObjectModel, *, count: int, seed: int, fidelity: str = "standard") -> GraspSet:
     """Plan candidates of a free object as in a job: with rollouts, and around the object's centre.
     Positions are rounded to the job's grid."""
-    rollout = rollout_on(DEFAULT_CONTEXT, hand, obj.centred, lambda: decompose(obj.centred), in_scenes=False)
+    rollout = create_rollout(DEFAULT_CONTEXT, hand, obj.centred, lambda: decompose(obj.centred), in_scenes=False)
     found = synthesize(hand, obj.centred, PlanRequest(count, FIDELITIES[fidelity], seed, rollout=rollout))
     return found.moved(np.zeros(3)).moved(obj.centre)
 

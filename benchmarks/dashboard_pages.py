@@ -26,7 +26,7 @@ import uvicorn
 from graspd.api.app import create_app
 from graspd.service.index.index import Index
 from graspd.service.pipeline.backends import Services
-from graspd.service.run.address import bind
+from graspd.service.run.address import bind_socket
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from tests.memory_queue import MemoryQueue
@@ -110,7 +110,7 @@ def first_paints(address: str, paths: Sequence[str]) -> dict[str, float]:
 
 @contextmanager
 def serving(settings: Settings, services: Services) -> Iterator[str]:
-    listener = bind("127.0.0.1", 0)
+    listener = bind_socket("127.0.0.1", 0)
     app = create_app(settings, services)
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.cells import Cell, cell_parser, cells
 from graspd.service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
-from graspd.worker.quality.diversity import distances, hand_points
+from graspd.worker.quality.diversity import grasp_distances, hand_points
 from graspd.worker.quality.table import measure
 
 NEAR_MM = (5, 10, 20)
@@ -23,7 +23,7 @@ def line(cell: Cell) -> tuple[str, list[int]]:
     """Return a table row and numbers of pairs: those closer than each of `NEAR_MM`, then all."""
     grasp = cell.grasps.grasp
     rows, others = np.triu_indices(len(grasp), 1)
-    apart = 1e3 * distances(hand_points(cell.hand, grasp), rows, others)
+    apart = 1e3 * grasp_distances(hand_points(cell.hand, grasp), rows, others)
     columns = measure(cell.hand, cell.obj, cell.grasps, thresholds_m=[0.005])
     types = Counter(GraspType(int(one)).name.lower() for one in columns["quality/grasp_type"])
     cells_used = np.bincount(columns["quality/approach_cell"], minlength=DIRECTION_CELLS).tolist()

@@ -20,7 +20,7 @@ from PIL import Image
 from benchmarks.cells import SEED, Cell, cell_parser, cells, write_json
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.worker.control.postures import hold_forces
-from graspd.worker.hands.pinch_postures import oppositions_of
+from graspd.worker.hands.pinch_postures import pinch_postures_of
 from graspd.worker.quality.contact import contact_distance_consistency_mm
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from graspd.worker.quality.table import measure
@@ -61,7 +61,7 @@ def found_out(cell: Cell) -> dict[str, Any]:
         "pieces": verdicts.pieces,
         "thickness_mm": 2e3 * obj.volume / float(area),
         "least_extent_mm": 1e3 * float(np.ptp(obj.vertices, axis=0).min()),
-        "widest_mm": 1e3 * oppositions_of(hand).widest,
+        "widest_mm": 1e3 * pinch_postures_of(hand).widest,
     }
 
 

@@ -34,7 +34,7 @@ from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.leading import PART
-from graspd.service.queue.entries import held_key, queue_name
+from graspd.service.queue.entries import lease_registry_key, queue_name
 from graspd.service.queue.rq_queue import EVENTS, RqQueue
 from graspd.service.run.embedded import server_command
 from graspd.service.settings import Settings
@@ -167,7 +167,7 @@ def measure(workers: int, given: argparse.Namespace) -> Result:
         at.submit(workers + int(given.rate * (given.seconds + task_s + 30)))
         with fleet(at.settings, workers, task_s):
             held = at.queue.connection
-            lists = [held_key(queue_name(priority, Stage.SYNTHESIZE)) for priority in Priority]
+            lists = [lease_registry_key(queue_name(priority, Stage.SYNTHESIZE)) for priority in Priority]
             _wait(lambda: sum(held.zcard(name) for name in lists) >= 0.9 * workers, "all workers hold a task")
             time.sleep(given.seconds / 2)
             lags, sweeps = _looks(at, given.seconds)

@@ -29,7 +29,14 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.messages import TaskMessage, capabilities
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.service.queue.entries import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
+from graspd.service.queue.entries import (
+    execution_keys,
+    job_key,
+    lease_registry_key,
+    list_key,
+    queue_name,
+    rq_worker_key,
+)
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import WORKERS, RqQueue, cancel_key, open_queue, put_event, worker_key
 from graspd.service.settings import Settings
@@ -88,7 +95,7 @@ class Fleet:
             due.append(self._held.pop(heapq.heappop(self._ends)[1]))
         list(self._pool.map(self._publish, (held.message for held in due)))
         for held in due:
-            pipe.zrem(held_key(held.queue), held.entry)
+            pipe.zrem(lease_registry_key(held.queue), held.entry)
             pipe.delete(*execution_keys(held.entry), held.job_key)
             self._say(pipe, held, EventKind.FINISHED, seconds=self._task_s, output=held.message["output"])
             self._idle.append(held.worker)
@@ -116,7 +123,7 @@ class Fleet:
         pipe.hset(execution, mapping={"id": held.entry, "last_heartbeat": time.time(), "worker_name": held.worker})
         pipe.expire(execution, LEASE_KEPT_S)
         pipe.zadd(executions, {held.entry: time.time() + LEASE_KEPT_S})
-        pipe.zadd(held_key(queue), {held.entry: time.time() + LEASE_KEPT_S})
+        pipe.zadd(lease_registry_key(queue), {held.entry: time.time() + LEASE_KEPT_S})
         pipe.hset(held.job_key, mapping={"status": "started", "worker_name": held.worker})
         self._say(pipe, held, EventKind.STARTED)
 
@@ -130,7 +137,7 @@ class Fleet:
             if held is not None:
                 execution, executions = execution_keys(held.entry)
                 kept_until = {held.entry: time.time() + LEASE_KEPT_S}
-                pipe.zscore(held_key(held.queue), held.entry)
+                pipe.zscore(lease_registry_key(held.queue), held.entry)
                 pipe.exists(cancel_key(held.message["task_id"]))
                 pipe.hset(rq_worker_key(name), "last_heartbeat", timestamp())
                 pipe.expire(rq_worker_key(name), LEASE_KEPT_S)
@@ -139,7 +146,7 @@ class Fleet:
                 pipe.zadd(executions, kept_until)
                 pipe.expire(executions, LEASE_KEPT_S)
                 for _ in range(2):
-                    pipe.zadd(held_key(held.queue), kept_until, xx=True)
+                    pipe.zadd(lease_registry_key(held.queue), kept_until, xx=True)
 
     def _say(self, pipe: Any, held: Held, kind: EventKind, **facts: Any) -> None:
         message = held.message

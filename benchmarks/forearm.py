@@ -24,7 +24,7 @@ import trimesh
 import yourdfpy
 
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.scene_spec import Box, NeighbourSpec, SceneSpec, supports_in
+from graspd.service.model.scene_spec import Box, NeighbourSpec, SceneSpec, scene_supports
 from graspd.worker.files.synthesis import SynthesisResult, synthesize_grasps
 from graspd.worker.hands.load import hand_from_path
 
@@ -94,7 +94,7 @@ def look(upstream: Upstream, made: SynthesisResult, beside: list[trimesh.Trimesh
     """Return the results for the links above the root of each grasp, among supports and neighbours."""
     columns, lowest, inside = made.arrays, [], []
     names = list(made.attributes.get("wrist_joint_names", []))
-    supports = [solid(one) for one in supports_in(made.place)]
+    supports = [solid(one) for one in scene_supports(made.place)]
     for row, scene in enumerate(columns["grasp/scene_index"]):
         wrist = columns["grasp/wrist_positions"][row] if names else ()
         links = upstream.at(dict(zip(names, map(float, wrist), strict=True)))

@@ -25,14 +25,14 @@ from benchmarks.cells import cell_parser, planned
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.transforms import Floats, apply, compose, invert
 from graspd.worker.grasps import GraspSet
-from graspd.worker.hands.collisions import resting_neighbours
+from graspd.worker.hands.collisions import collision_exempt_pairs
 from graspd.worker.hands.hand_matching import HandMatch, match_hands
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.quality.intervals import wilson
-from graspd.worker.validation.foreign import transfer_grasps, with_drives_of
+from graspd.worker.quality.intervals import wilson_interval
+from graspd.worker.validation.foreign import transfer_drives, transfer_grasps
 from graspd.worker.validation.validator import validate
 
 HAND = "hands/shadow/shadow_hand_right.urdf"
@@ -83,7 +83,7 @@ def _moved(piece: ConvexPiece, body: int, frame: Floats) -> ConvexPiece:
 
 def _dressed(hand: HandModel, pieces: tuple[ConvexPiece, ...]) -> HandModel:
     dressed = replace(hand, pieces=pieces)
-    return replace(dressed, neighbours=resting_neighbours(dressed))
+    return replace(dressed, neighbours=collision_exempt_pairs(dressed))
 
 
 def main() -> None:
@@ -117,7 +117,7 @@ class Bench:
         other = hand_from_path(theirs, drag=True)
         self.hands = {plan: hand_from_path(ours, options) for plan, options in PLANS.items()}
         found = {plan: match_hands(hand, other) for plan, hand in self.hands.items()}
-        self.same = {plan: replace(same, theirs=with_drives_of(same)) for plan, same in found.items()}
+        self.same = {plan: replace(same, theirs=transfer_drives(same)) for plan, same in found.items()}
 
     def candidates(self, obj: ObjectModel, count: int, seed: int) -> dict[str, dict[str, list[int]]]:
         """Return, for each variant of planning and each model, the success of each grasp."""
@@ -232,7 +232,7 @@ def _share(nominal: Flags, foreign: Flags) -> str:
 def _share_of(part: int, whole: int) -> str:
     if not whole:
         return "none"
-    low, high = wilson(part, whole)
+    low, high = wilson_interval(part, whole)
     return f"{part / whole:.2f} ({math.floor(100 * low) / 100:.2f} to {math.ceil(100 * high) / 100:.2f})"
 
 

@@ -35,7 +35,7 @@ from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.model import MujocoOptions, scene_of
-from graspd.worker.validation.payload import LIFTING, LiftPayload, PushPayload, limit_of
+from graspd.worker.validation.payload import LIFTING, LiftPayload, PushPayload, payload_limit
 from graspd.worker.validation.protocol import DIRECTIONS, Outcome, Rollout
 
 SEED: Final = 1500
@@ -61,13 +61,15 @@ class WholeLifts(LiftPayload):
     """Payload by the validator's rise and hold."""
 
     def payload(self, grasps: GraspSet, row: int) -> float:
-        self._weigh(self._own)
-        if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED or not self._close(grasps, row, give_up=True):
+        self._set_mass(self._own)
+        if self._set_up_scene(grasps, row).outcome is not LiftOutcome.NOT_TRIED or not self._close(
+            grasps, row, give_up=True
+        ):
             return float("nan")
         self._save()
 
         def bears(mass: float) -> bool:
-            self._weigh(mass)
+            self._set_mass(mass)
             self._restore()
             self._goal = np.zeros(3)
             self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push_force * self._up
@@ -82,13 +84,15 @@ class WholePushes(PushPayload):
     """Payload by the validator's pushes."""
 
     def payload(self, grasps: GraspSet, row: int) -> float:
-        self._weigh(self._own)
-        if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION or not self._close(grasps, row, give_up=True):
+        self._set_mass(self._own)
+        if self._set_up_test(grasps, row).outcomes[0] is Outcome.PENETRATION or not self._close(
+            grasps, row, give_up=True
+        ):
             return float("nan")
         self._save()
 
         def bears(mass: float) -> bool:
-            self._weigh(mass)
+            self._set_mass(mass)
             for direction in range(len(DIRECTIONS)):
                 self._restore()
                 self._push(direction)
@@ -146,7 +150,7 @@ def of_pair(given: Any, hand: HandModel, name: str, mass: float) -> tuple[Floats
             milliseconds[k, row] = 1e3 * (time.process_time() - began)
     # Grasps are valid, so they lift at least the object.
     kilograms = np.nan_to_num(kilograms, nan=obj.mass)
-    strongest = limit_of(
+    strongest = payload_limit(
         hand,
         obj,
         squeezed(hand, obj, grasps),

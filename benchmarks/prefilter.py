@@ -20,9 +20,9 @@ import numpy as np
 from benchmarks.cells import Cell, cell_parser, cells, write_json
 from graspd.worker.engines.devices import Device, cpu_name
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.quality.intervals import wilson
+from graspd.worker.quality.intervals import wilson_interval
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.model import MujocoOptions, build
+from graspd.worker.validation.model import MujocoOptions, build_scene
 from graspd.worker.validation.prefilter.prefilter import PrefilterOutcomes, WorldPool, mujoco_warp
 
 OBJECTS = ("005_tomato_soup_can", "025_mug", "011_banana", "035_power_drill")
@@ -31,7 +31,7 @@ JITTER_M = 1e-4
 
 
 def pool_of(cell: Cell, device: str, worlds: int) -> WorldPool:
-    return WorldPool(build(cell.hand, cell.obj, decompose(cell.obj), MujocoOptions()), device, worlds)
+    return WorldPool(build_scene(cell.hand, cell.obj, decompose(cell.obj), MujocoOptions()), device, worlds)
 
 
 def agreement(cell: Cell, device: str) -> dict[str, Any]:
@@ -62,7 +62,7 @@ def together(rows: list[dict[str, Any]]) -> dict[str, Any]:
     total = {key: sum(row[key] for row in rows) for key in rows[0] if key not in ("hand", "object")}
     clear = total["clear_holds"] + total["clear_failures"]
     wrong = total["false_accepts"] + total["false_refusals"]
-    low, high = wilson(clear - wrong, clear)
+    low, high = wilson_interval(clear - wrong, clear)
     return total | {
         "hand": rows[0]["hand"] if len({row["hand"] for row in rows}) == 1 else "all",
         "clear_share": clear / total["n"],

@@ -28,7 +28,7 @@ from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.pinch_postures import oppositions_of
+from graspd.worker.hands.pinch_postures import pinch_postures_of
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.fast_graspd.antipodal_starts import crossings_of
 from graspd.worker.scenes.placement import scenes_of
@@ -107,7 +107,7 @@ def main() -> None:
 def lift_share(hand: HandModel, folder: Path, grasps: int) -> float | None:
     """Return the share of candidates that lift an object off a table; None if it is refused or too wide."""
     obj, jaws = object_from_path(folder / "clean.stl"), jaws_of(hand)
-    widest = oppositions_of(hand).widest if jaws is None else jaws.opening
+    widest = pinch_postures_of(hand).widest if jaws is None else jaws.opening
     if np.mean(crossings_of(obj).width <= widest) < FITTING:
         return None
     scenes, _ = scenes_of(SceneSpec(kind="table"), obj, count=SCENES, seed=SEED)

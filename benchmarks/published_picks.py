@@ -33,14 +33,14 @@ from graspd.service.model.transforms import quat_rotate
 from graspd.worker.control.postures import TOTAL_NORMAL_FORCE, squeeze
 from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.quality.intervals import wilson
+from graspd.worker.quality.intervals import wilson_interval
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import RISE_M, Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lift import Lift, LiftOutcome
 from graspd.worker.validation.lifting import validate_lifts
-from graspd.worker.validation.model import MujocoOptions, build
+from graspd.worker.validation.model import MujocoOptions, build_scene
 from graspd.worker.validation.protocol import STAGE_S, Outcome, Rollout
 from graspd.worker.validation.validator import validate
 
@@ -97,15 +97,15 @@ class Pick(Lift):
 
     def pick(self, grasps: GraspSet, row: int) -> tuple[str, float]:
         """Return the outcome, and the worst motion over its limit."""
-        if self._begin(grasps, row).outcome is LiftOutcome.PENETRATION:
+        if self._set_up_scene(grasps, row).outcome is LiftOutcome.PENETRATION:
             return "penetration", 2.0
         self._close(grasps, row)
         if self._steps and self._lost():
-            return "lost while closing", self._excess()
+            return "lost while closing", self._motion_excess()
         self._up_slowly(grasps, row) if self.terms.slowly else self._rise(grasps, row)
         self._goal = RISE_M * self._up
         outcome = self._validate(Rollout())
-        return ("lifted" if outcome is Outcome.HELD else outcome.name.lower()), self._excess()
+        return ("lifted" if outcome is Outcome.HELD else outcome.name.lower()), self._motion_excess()
 
     def _up_slowly(self, grasps: GraspSet, row: int) -> None:
         squeezed = grasps.squeeze
@@ -118,7 +118,7 @@ class Pick(Lift):
         self._run(1.5)
 
     def _lost(self) -> bool:
-        moved, turned = self._motion()
+        moved, turned = self._object_motion()
         return bool(is_invalid(self.data) or moved > 2 * FALLEN_M or turned > 2 * TURNED)
 
     def _validate(self, rollout: Rollout) -> Outcome:
@@ -126,9 +126,9 @@ class Pick(Lift):
             return super()._validate(rollout)
         if is_invalid(self.data):
             return Outcome.DIVERGED
-        if abs(float(self._offset() @ self._up)) >= FALLEN_M:
+        if abs(float(self._object_displacement() @ self._up)) >= FALLEN_M:
             return Outcome.DISPLACED
-        return Outcome.ROTATED if self._motion()[1] >= TURNED else Outcome.HELD
+        return Outcome.ROTATED if self._object_motion()[1] >= TURNED else Outcome.HELD
 
 
 def on_table(case: Case) -> PlacedGrasps:
@@ -148,7 +148,7 @@ def picked(case: Case, pieces: ConvexPieces, terms: Terms) -> dict[str, Any]:
         grasps = replace(grasps, pregrasp=grasps.grasp)
     placed = on_table(case)
     obj = obj.with_mass(density=DENSITY) if terms.light else obj
-    scene = build(hand, obj, pieces, MujocoOptions(friction=(terms.friction, 0.02)), placed.supports)
+    scene = build_scene(hand, obj, pieces, MujocoOptions(friction=(terms.friction, 0.02)), placed.supports)
 
     def part(rows: range) -> list[tuple[str, float]]:
         test = Pick(scene, placed, terms)
@@ -270,7 +270,7 @@ def row(words: str, held: NDArray[np.bool_], margin: Floats | None, truth: NDArr
         "n": len(truth),
         "holds": float(held.mean()),
         "agreement": agree / len(truth),
-        "interval": [round(bound, 4) for bound in wilson(agree, len(truth))],
+        "interval": [round(bound, 4) for bound in wilson_interval(agree, len(truth))],
         "fails_both": right,
         "fails_here_alone": wrong,
         "p_against_constant": chance,

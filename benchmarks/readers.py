@@ -66,7 +66,7 @@ def plain_drawn(shards: Shards, order: Sequence[int], places: Sequence[PictureAd
 
 def _whole(shards: Shards, kind: str, columns: Sequence[str]) -> int:
     count = 0
-    for file in shards.of(kind):
+    for file in shards.of_kind(kind):
         with h5py.File(shards.path(file), "r") as opened:
             found = [opened[name][()] for name in columns]
             count += len(found[0])
@@ -75,7 +75,7 @@ def _whole(shards: Shards, kind: str, columns: Sequence[str]) -> int:
 
 def _row_by_row(shards: Shards, kind: str, columns: Sequence[str]) -> int:
     count = 0
-    for file in shards.of(kind):
+    for file in shards.of_kind(kind):
         with h5py.File(shards.path(file), "r") as opened:
             for row in range(len(opened[columns[0]])):
                 for name in columns:
@@ -91,7 +91,7 @@ def ways(shards: Shards) -> dict[str, Trajectory]:
         "h5py, grasp by grasp": Trajectory(lambda: plain_rows(shards), "h5py, grasp by grasp"),
         "Grasps, one by one": Trajectory(lambda: sum(1 for _ in Grasps(shards, valid=False)), "h5py, grasp by grasp"),
     }
-    if shards.of("views"):
+    if shards.of_kind("views"):
         found |= of_pictures(shards)
     try:
         return found | loaders(shards)
@@ -128,7 +128,7 @@ def loaders(shards: Shards) -> dict[str, Trajectory]:
             for own in by_hand(shards)
         ]
         found[f"ShuffledShards, {processes} processes"] = Trajectory(rows_of(streams), "h5py, grasp by grasp")
-        if shards.of("views"):
+        if shards.of_kind("views"):
             pictures = DataLoader(Samples(Pictures(shards)), 8, num_workers=processes, collate_fn=collate)
             found[f"Pictures, DataLoader, {processes} processes"] = Trajectory(
                 rows_of([pictures]), "h5py, pictures in bulk"
@@ -138,7 +138,7 @@ def loaders(shards: Shards) -> dict[str, Trajectory]:
 
 def by_hand(shards: Shards) -> list[Shards]:
     """Return the shards of each hand: hands differ in their joints, so grasps have no common array."""
-    return [shards.only(hands=[hand]) for hand in dict.fromkeys(file.hand for file in shards)]
+    return [shards.select(hands=[hand]) for hand in dict.fromkeys(file.hand for file in shards)]
 
 
 def arrays_of(shards: Shards) -> int:

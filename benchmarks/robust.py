@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import Cell, cell_parser, cells, write_json
-from graspd.service.model.metrics import AXIS_MEANINGS, ROBUST_MODELS, Axis
+from graspd.service.model.metrics import AXIS_MEANINGS, ROBUST_MODELS, PerturbedParameter
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.quality.intervals import wilson
+from graspd.worker.quality.intervals import wilson_interval
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions
-from graspd.worker.validation.refit import fits_of
+from graspd.worker.validation.refit import applicable_fits
 from graspd.worker.validation.robust import reaches_share, validate_robustness
 from graspd.worker.validation.variant import NOMINAL, SHAPES, Models, Variant, axes_of, couplings_of, draw_variant
 
@@ -48,13 +48,17 @@ def kinds(cell: Cell, draws: int) -> dict[str, list[Callable[[np.random.Generato
     hand = cell.hand
     found: dict[str, list[Callable[[np.random.Generator], Variant]]] = {}
     for fit, grown in SHAPES:
-        if fit == "own" or fit in fits_of(hand):
+        if fit == "own" or fit in applicable_fits(hand):
             name = WORDS[fit] or f"{1e3 * grown:+.0f} mm"
-            found[f"{AXIS_MEANINGS[Axis.SHAPES]}: {name}"] = [lambda _, f=fit, g=grown: Variant(fit=f, grown_m=g)]  # type: ignore[misc]
+            found[f"{AXIS_MEANINGS[PerturbedParameter.SHAPES]}: {name}"] = [
+                lambda _, f=fit, g=grown: Variant(fit=f, grown_m=g)
+            ]  # type: ignore[misc]
     for coupling in couplings_of(hand):
-        found[f"{AXIS_MEANINGS[Axis.COUPLINGS]}: {coupling}"] = [lambda _, c=coupling: Variant(coupling=c)]  # type: ignore[misc]
+        found[f"{AXIS_MEANINGS[PerturbedParameter.COUPLINGS]}: {coupling}"] = [
+            lambda _, c=coupling: Variant(coupling=c)
+        ]  # type: ignore[misc]
     for axis in axes_of(hand):
-        if axis not in (Axis.SHAPES, Axis.COUPLINGS):
+        if axis not in (PerturbedParameter.SHAPES, PerturbedParameter.COUPLINGS):
             found[AXIS_MEANINGS[axis]] = [lambda rng, a=axis: draw_variant(a, hand, rng)] * draws  # type: ignore[misc]
     found[ALL] = [lambda rng: together(draw_variant(axis, hand, rng) for axis in axes_of(hand))] * draws
     return found
@@ -107,7 +111,7 @@ def summed(hand: str, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
         for name, (held, n) in cell["rows"].items():
             rows[name] = [held + rows.get(name, [0, 0])[0], n + rows.get(name, [0, 0])[1]]
     shares = np.concatenate([np.array(cell["shares"]) for cell in every])
-    weakest = Counter(AXIS_MEANINGS[Axis(one)] for cell in every for one in cell["weakest"] if one)
+    weakest = Counter(AXIS_MEANINGS[PerturbedParameter(one)] for cell in every for one in cell["weakest"] if one)
     candidates = len(shares)
     reached = {f"{wanted:g}": int(reaches_share(shares, wanted).sum()) for wanted in SHARES}
     return {
@@ -180,7 +184,7 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
 def _cell(counts: list[int] | None) -> str:
     if counts is None:
         return "-"
-    low, high = wilson(*counts)
+    low, high = wilson_interval(*counts)
     return f"{100 * counts[0] / counts[1]:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
 
 

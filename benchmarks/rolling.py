@@ -66,12 +66,12 @@ def main() -> None:
 def poses_of(obj: ObjectModel, variants: int) -> list[str]:
     """Return the table cells of each resting face, the most frequent face first."""
     faces = resting_faces(obj)
-    table = simulate._build(obj.centred)
+    table = simulate._build_table(obj.centred)
     with patch.object(RestingFaces, "can_topple", lambda self, face: False):
-        found = np.array([simulate._redo_until_rest(table, (SEED, k)).face for k in range(DROPS)])
+        found = np.array([simulate._drop_until_rest(table, (SEED, k)).face for k in range(DROPS)])
     steady, cells = not all(faces.can_roll(int(face)) for face in found), []
     for face, count in sorted(zip(*np.unique(found, return_counts=True), strict=True), key=lambda one: -one[1]):
-        turn, _ = faces.looseness(int(face))
+        turn, _ = faces.possible_motion(int(face))
         pose = lay_flat(faces, int(face), np.array([0.0, 0, 0, 1, 0, 0, 0]))
         angles = np.degrees(turns(obj, pose, variants))
         word = "topples" if faces.can_topple(int(face)) else "rolls" if steady and faces.can_roll(int(face)) else "kept"

@@ -28,14 +28,14 @@ from graspd.service.model.version import PACKAGE_VERSION
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.pinch_postures import oppositions_of
+from graspd.worker.hands.pinch_postures import pinch_postures_of
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import ExecutionContext, PlanRequest, synthesize
 from graspd.worker.planners.fast_graspd.antipodal_starts import Openings
 from graspd.worker.scenes.clearance import MARGIN_M
 from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.scenes.rollout import rollout_on
+from graspd.worker.scenes.rollout import create_rollout
 from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
@@ -86,7 +86,7 @@ def study(
     count = max(least, per_face * len(poses))
     placed = Scenes(supports_of(spec), poses).placed(np.arange(count) % len(poses))
     wanted, run = PlanRequest(count, FIDELITY, seed), ExecutionContext(threads=1)
-    lifts, pushes = (rollout_on(run, hand, obj, lambda: pieces, in_scenes=where) for where in (True, False))
+    lifts, pushes = (create_rollout(run, hand, obj, lambda: pieces, in_scenes=where) for where in (True, False))
     # Untimed preparation, which every pair needs once.
     for where, rollout in ((placed.take(slice(0, 1)), lifts), (None, pushes)):
         synthesize(hand, obj, PlanRequest(1, FIDELITY, SEED, placed=where, rollout=rollout), run)
@@ -101,7 +101,7 @@ def study(
     rate, free_rate = found["lift"] / seconds, free_lift / free_seconds
     held = np.asarray(found.pop("rows"))
     faces = np.array([held[placed.index == s].any() for s in range(len(poses))])
-    known = oppositions_of(hand)
+    known = pinch_postures_of(hand)
     reach = np.array([Openings.of(known, obj, scene).within_reach for scene in placed.scenes])
     return {
         **found,

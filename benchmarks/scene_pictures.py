@@ -27,7 +27,7 @@ from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PlanRequest, synthesize
 from graspd.worker.rendering.cameras import FIELD_OF_VIEW, GivenCameras, distance_to_fill, look_at
 from graspd.worker.rendering.hands import DrawnHand
-from graspd.worker.rendering.sheets import label_page, scene_cells, with_palette
+from graspd.worker.rendering.sheets import label_page, reduce_to_palette, scene_cells
 from graspd.worker.rendering.views import Extras, render
 from graspd.worker.scenes import Neighbours, drop, drop_together, transfer_grasps
 
@@ -54,7 +54,7 @@ def paint(hands: Sequence[HandModel], objects: Sequence[ObjectModel], folder: Pa
     if len(objects) > 2:
         pages["neighbours"] = lambda: _neighbours(objects, device, seed)
     for name, page in pages.items():
-        (folder / f"{name}.png").write_bytes(with_palette(page()))
+        (folder / f"{name}.png").write_bytes(reduce_to_palette(page()))
 
 
 def _seen(

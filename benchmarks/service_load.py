@@ -25,7 +25,7 @@ import graspd.worker.process.main as worker_main
 from graspd.api.access.keys import KeyFile, Scope
 from graspd.service.index.index import Index
 from graspd.service.model import names
-from graspd.service.model.planning import message_of, plan_tasks, task_id
+from graspd.service.model.planning import create_task_message, plan_tasks, task_id
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline import job_actions
@@ -134,7 +134,10 @@ def indexer(url: str | None) -> None:
         add_assets(services)
         job = job_actions.submit(services, request(grasps=32 * 1000, seed=time.time_ns() % 10**6))[0].id
         record = read_record(JobRecord, services.store, names.job_record_key(job))
-        made = [make_shard(services.store, message_of(record, t, attempt=1, max_attempt=3)) for t in plan_tasks(record)]
+        made = [
+            make_shard(services.store, create_task_message(record, t, attempt=1, max_attempt=3))
+            for t in plan_tasks(record)
+        ]
         start = time.perf_counter()
         for begin in range(0, len(made), 100):
             index.write.add_manifests(made[begin : begin + 100])
@@ -222,7 +225,9 @@ def beside(url: str | None) -> None:
                 job, answered = post(http, small, 32)
                 began, task = time.perf_counter(), task_id(job, Stage.SYNTHESIZE, 0)
                 # A task that a worker has taken is no longer in the queue, nor queued in the index.
-                while task not in services.queue.waiting() and services.index.jobs.task(task).state is State.QUEUED:
+                while (
+                    task not in services.queue.waiting_tasks() and services.index.jobs.task(task).state is State.QUEUED
+                ):
                     time.sleep(0.01)
                 answers.append(answered)
                 queued.append(answered + time.perf_counter() - began)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cells import cell_parser, cells, write_json
-from graspd.worker.quality.intervals import wilson
+from graspd.worker.quality.intervals import wilson_interval
 
 CORES = 2
 LEVELS = ("dexgraspbench", "standard", "fast")
@@ -29,7 +29,7 @@ def row(found: list[dict[str, Any]], dexgraspbench: np.ndarray) -> dict[str, Any
         "n": len(held),
         "held": float(held.mean()),
         "agreement": agree / len(held),
-        "interval": [round(bound, 4) for bound in wilson(agree, len(held))],
+        "interval": [round(bound, 4) for bound in wilson_interval(agree, len(held))],
         "false_accepts": int((held & ~dexgraspbench).sum()),
         "false_rejects": int((~held & dexgraspbench).sum()),
         "cpu_ms_per_candidate": 1e3 * cpu / len(held),

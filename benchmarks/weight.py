@@ -30,8 +30,8 @@ EXTRAS: Final = ("", "api", "worker", "all", "dev")
 LARGEST: Final = 6
 _COMMAND: Final = "import sys; sys.argv = ['graspd', {}]; import graspd.cli; graspd.cli.main()"
 _OURS: Final = (
-    "from graspd.service.model.libraries import mark_process, pause_garbage_collection as imports\n"
-    "mark_process()\nwith imports(): {}"
+    "from graspd.service.model.libraries import freeze_imports, pause_garbage_collection as imports\n"
+    "freeze_imports()\nwith imports(): {}"
 )
 _ENGINE: Final = "import graspd.worker.generation, graspd.worker.planners.fast_graspd.planner"
 #: Starts that users wait for, with their code.

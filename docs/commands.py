@@ -166,7 +166,7 @@ def _graspd_fault(words: Sequence[str]) -> str:
 
 @cache
 def _loaded(module: str, name: str) -> Any:
-    return graspd.cli.load(module, name)
+    return graspd.cli.load_command(module, name)
 
 
 def _resolved(command: Any, words: list[str]) -> tuple[Any, list[str]]:
@@ -175,7 +175,7 @@ def _resolved(command: Any, words: list[str]) -> tuple[Any, list[str]]:
         inner = command.get_command(None, words[0])
         if inner is None:
             return f"{command.name} has no {words[0]}", words
-        if isinstance(inner, graspd.cli.Deferred):
+        if isinstance(inner, graspd.cli.DeferredCommand):
             inner = _loaded(inner.module, words[0])
         command, words = inner, words[1:]
     return command, words

@@ -36,7 +36,7 @@ def write_hand(hand: HandModel, config: str, root: Path) -> Path:
     for number, piece in enumerate(hand.pieces):
         if piece.kind == "hull":
             write_obj(root / folder / "meshes" / f"piece_{number:03}.obj", piece.vertices, piece.faces)
-    tree = _model(hand)
+    tree = _hand_model(hand)
     ElementTree.indent(tree)
     (root / folder / "hand.xml").write_text(ElementTree.tostring(tree, encoding="unicode") + "\n")
     (root / "config" / "hand").mkdir(parents=True, exist_ok=True)
@@ -46,10 +46,10 @@ def write_hand(hand: HandModel, config: str, root: Path) -> Path:
 
 def body_names(hand: HandModel) -> tuple[str, ...]:
     """Return the names (L,) of the hand's bodies in the model."""
-    return tuple(f"{'root' if b == 0 else _finger(hand, b)}_{name}" for b, name in enumerate(hand.body_names))
+    return tuple(f"{'root' if b == 0 else _finger_prefix(hand, b)}_{name}" for b, name in enumerate(hand.body_names))
 
 
-def _finger(hand: HandModel, body: int) -> str:
+def _finger_prefix(hand: HandModel, body: int) -> str:
     """Return the finger of a body, numbered by the child of the root that leads to the body."""
     return f"f{np.flatnonzero(hand.parent == 0).tolist().index(hand.chain(body)[-1])}"
 
@@ -57,7 +57,7 @@ def _finger(hand: HandModel, body: int) -> str:
 def _configuration(hand: HandModel, model: Path) -> str:
     """Return the configuration as JSON, which is valid YAML."""
     names = body_names(hand)
-    fingers = [f"{_finger(hand, int(b))}_" for b in np.flatnonzero(hand.parent == 0)]
+    fingers = [f"{_finger_prefix(hand, int(b))}_" for b in np.flatnonzero(hand.parent == 0)]
     values: dict[str, Any] = {
         "xml_path": model.as_posix(),
         "mocap": True,
@@ -71,7 +71,7 @@ def _configuration(hand: HandModel, model: Path) -> str:
     return "".join(f"{key}: {json.dumps(value)}\n" for key, value in values.items())
 
 
-def _model(hand: HandModel) -> Element:
+def _hand_model(hand: HandModel) -> Element:
     top = Element("mujoco", model=hand.name)
     SubElement(top, "compiler", angle="radian", meshdir="meshes", autolimits="true")
     assets, world = SubElement(top, "asset"), SubElement(top, "worldbody")
@@ -82,7 +82,7 @@ def _model(hand: HandModel) -> Element:
         else:
             pose = hand.origin[b]
             above = bodies[int(hand.parent[b])]
-            body = SubElement(above, "body", name=names[b], pos=_text(pose[:3]), quat=_text(pose[3:]))
+            body = SubElement(above, "body", name=names[b], pos=_numbers_text(pose[:3]), quat=_numbers_text(pose[3:]))
             _add_joint(body, hand, b)
         bodies.append(body)
         _add_solids(body, assets, hand, b)
@@ -93,12 +93,12 @@ def _model(hand: HandModel) -> Element:
     for tendon in hand.tendons:
         fixed = SubElement(tendons, "fixed", name=tendon.name)
         for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
-            SubElement(fixed, "joint", joint=hand.dof_names[d], coef=_text([pull]))
+            SubElement(fixed, "joint", joint=hand.dof_names[d], coef=_numbers_text([pull]))
     _add_drives(SubElement(top, "equality"), SubElement(top, "actuator"), hand)
     return top
 
 
-def _joint_of(hand: HandModel, body: int) -> str:
+def _joint_name(hand: HandModel, body: int) -> str:
     return hand.joint_names[hand.joint_body.tolist().index(body)]
 
 
@@ -108,11 +108,11 @@ def _add_joint(body: Element, hand: HandModel, b: int) -> None:
     SubElement(
         body,
         "joint",
-        name=_joint_of(hand, b),
-        axis=_text(hand.axis[b]),
-        range=_text(ends),
+        name=_joint_name(hand, b),
+        axis=_numbers_text(hand.axis[b]),
+        range=_numbers_text(ends),
         type="hinge" if hand.joint_type[b] == JointType.REVOLUTE else "slide",
-        damping=_text([_DAMPING_TIME * float(hand.stiffness[d])]),
+        damping=_numbers_text([_DAMPING_TIME * float(hand.stiffness[d])]),
     )
 
 
@@ -121,25 +121,27 @@ def _add_solids(body: Element, assets: Element, hand: HandModel, b: int) -> None
     mine = [(number, piece) for number, piece in enumerate(hand.pieces) if piece.body == b]
     if not mine:
         inertia = 0.4 * mass * _BARE["radius"] ** 2
-        SubElement(body, "inertial", pos="0 0 0", mass=_text([mass]), diaginertia=_text([inertia] * 3))
+        SubElement(body, "inertial", pos="0 0 0", mass=_numbers_text([mass]), diaginertia=_numbers_text([inertia] * 3))
         return
     share = np.array([float(np.prod(np.ptp(piece.vertices, axis=0))) for _, piece in mine])
     for (number, piece), part in zip(mine, share / share.sum(), strict=True):
-        geom = SubElement(body, "geom", {"mass": _text([mass * float(part)]), **_shape(piece, number)})
+        geom = SubElement(
+            body, "geom", {"mass": _numbers_text([mass * float(part)]), **_geom_attributes(piece, number)}
+        )
         if piece.kind == "hull":
             geom.set("mesh", f"piece_{number:03}")
             SubElement(assets, "mesh", name=f"piece_{number:03}", file=f"piece_{number:03}.obj")
 
 
-def _shape(piece: ConvexPiece, number: int) -> dict[str, str]:
+def _geom_attributes(piece: ConvexPiece, number: int) -> dict[str, str]:
     if piece.kind == "hull":
         return {"name": f"piece_{number:03}", "type": "mesh"}
     size = [0.5 * extent for extent in piece.size]
     if piece.kind != "box":
         # Radius, then half the length.
         size = [piece.size[0], *(0.5 * length for length in piece.size[1:])]
-    place = {"pos": _text(piece.pose[:3]), "quat": _text(piece.pose[3:])}
-    return {"name": f"piece_{number:03}", "type": piece.kind, "size": _text(size), **place}
+    place = {"pos": _numbers_text(piece.pose[:3]), "quat": _numbers_text(piece.pose[3:])}
+    return {"name": f"piece_{number:03}", "type": piece.kind, "size": _numbers_text(size), **place}
 
 
 def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
@@ -154,20 +156,20 @@ def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
         lead, *others = [int(b) for b in hand.joint_body if hand.dof[b] == d]
         m = float(hand.multiplier[lead])
         gain, limit = float(hand.stiffness[d]) / m**2, float(hand.effort[d]) / abs(m)
-        _add_actuator(actuators, name, {"joint": _joint_of(hand, lead)}, gain, limit)
+        _add_actuator(actuators, name, {"joint": _joint_name(hand, lead)}, gain, limit)
         for b in others:
             ratio = float(hand.multiplier[b]) / m
             start = float(hand.offset[b]) - ratio * float(hand.offset[lead])
-            pair = {"joint1": _joint_of(hand, b), "joint2": _joint_of(hand, lead)}
-            SubElement(equality, "joint", {**pair, "polycoef": _text([start, ratio, 0, 0, 0]), **_COUPLING})
+            pair = {"joint1": _joint_name(hand, b), "joint2": _joint_name(hand, lead)}
+            SubElement(equality, "joint", {**pair, "polycoef": _numbers_text([start, ratio, 0, 0, 0]), **_COUPLING})
 
 
 def _add_actuator(actuators: Element, name: str, driven: dict[str, str], gain: float, limit: float) -> None:
-    values = {"kp": _text([gain]), "forcerange": _text([-limit, limit])}
+    values = {"kp": _numbers_text([gain]), "forcerange": _numbers_text([-limit, limit])}
     SubElement(actuators, "position", {"name": name, **driven, **values})
 
 
-def _text(values: Any) -> str:
+def _numbers_text(values: Any) -> str:
     return " ".join(f"{float(value):.12g}" for value in values)
 
 
@@ -195,16 +197,16 @@ class HandMapping:
 
     def qpos(self, hand: HandModel, root: Floats, joints: Floats) -> Floats:
         """Return `qpos` (7 + J,) from graspd's root pose (7,) and joints (J,)."""
-        return np.concatenate([compose(root, invert(np.array(self.root_in_model))), joints[self._order(hand)]])
+        return np.concatenate([compose(root, invert(np.array(self.root_in_model))), joints[self._joint_order(hand)]])
 
     def posture(self, hand: HandModel, qpos: Floats) -> tuple[Floats, Floats]:
         """Return graspd's root poses (N, 7) and joints (N, J) from `qpos` (N, 7 + J).
         Raises InputError, like `qpos`: the hand has another root link or other joints."""
         joints = np.empty_like(qpos[:, 7:])
-        joints[:, self._order(hand)] = qpos[:, 7:]
+        joints[:, self._joint_order(hand)] = qpos[:, 7:]
         return compose(qpos[:, :7], np.array(self.root_in_model)), joints
 
-    def _order(self, hand: HandModel) -> list[int]:
+    def _joint_order(self, hand: HandModel) -> list[int]:
         names = [ours for _, ours in self.joints]
         if hand.root_link != self.root_link or sorted(names) != sorted(hand.joint_names):
             raise InputError(
@@ -219,17 +221,17 @@ class HandMapping:
         (folder / FILE).write_text(json.dumps(said, indent=1) + "\n")
 
 
-def mapping_of(file: Path) -> HandMapping | None:
+def load_mapping(file: Path) -> HandMapping | None:
     """Load the mapping of a grasp file's experiment; None if there is none.
     Raises InputError: the mapping is invalid."""
     for above in file.resolve().parents:
         if above.name in _FOLDERS:
-            return _read(above.parent / FILE)
+            return _read_mapping(above.parent / FILE)
     return None
 
 
 @lru_cache(maxsize=64)
-def _read(path: Path) -> HandMapping | None:
+def _read_mapping(path: Path) -> HandMapping | None:
     if not path.is_file():
         return None
     try:

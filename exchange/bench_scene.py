@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 
 from graspd.exchange.bench_hand import HandMapping
-from graspd.exchange.imported import load_npy, mesh_file, urdf_of, write_obj
+from graspd.exchange.imported import load_npy, urdf_text, write_mesh, write_obj
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
@@ -40,21 +40,21 @@ def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
     folder, scene = SET / "processed_data" / name, SET / "scene_cfg" / name / "floating" / f"{SCALE}.npy"
     for part in (folder / "mesh", folder / "info", folder / "urdf" / "meshes", SET / "valid_split"):
         (root / part).mkdir(parents=True, exist_ok=True)
-    mesh_file(obj, root / folder / "mesh" / "simplified.obj")
+    write_mesh(obj, root / folder / "mesh" / "simplified.obj")
     pieces = [hull(corners) for corners in decompose(obj).vertices]
     meshes = root / folder / "urdf" / "meshes"
     # The evaluator reads all files of this folder as pieces, so those of an earlier export are removed.
     for old in meshes.iterdir():
         old.unlink()
     written = [write_obj(meshes / f"convex_piece_{k:03}.obj", *piece) for k, piece in enumerate(pieces)]
-    urdf = urdf_of(name, "object", [f"meshes/{file.name}" for file in written])
+    urdf = urdf_text(name, "object", [f"meshes/{file.name}" for file in written])
     (root / folder / "urdf" / "coacd.urdf").write_text(urdf)
     _, extents = trimesh.bounds.oriented_bounds(obj.hull_vertices)
     facts: Row = {"gravity_center": obj.centre_of_mass.tolist(), "obb": np.asarray(extents, float).tolist()}
     mass = sum(volume("hull", (), corners, faces) for corners, faces in pieces)
     facts |= {"scale": 1.0, "density": 1.0, "mass": mass}
     (root / folder / "info" / "simplified.json").write_text(json.dumps(facts, indent=1) + "\n")
-    save_record(root / scene, _scene(name, f"floating/{SCALE}", IDENTITY_POSE))
+    save_record(root / scene, _scene_configuration(name, f"floating/{SCALE}", IDENTITY_POSE))
     split = root / SET / "valid_split" / "all.json"
     names = json.loads(split.read_text()) if split.is_file() else []
     split.write_text(json.dumps(sorted({*names, name}), indent=1) + "\n")
@@ -65,7 +65,7 @@ def write_table(name: str, pose: Floats, number: int, root: Path) -> Path:
     """Write the scene of an exported object at `pose` (7,) on a table; return its file relative to `root`."""
     place = f"{TABLETOP}/{SCALE}_pose{number:03}"
     file = SET / "scene_cfg" / name / f"{place}.npy"
-    scene = _scene(name, place, pose)
+    scene = _scene_configuration(name, place, pose)
     scene["scene"]["table"] = {"type": "plane", "pose": IDENTITY_POSE.copy(), "size": np.array([0.0, 0.0, 1.0])}
     save_record(root / file, scene)
     return file
@@ -77,7 +77,7 @@ def save_record(file: Path, record: Row) -> None:
     np.save(file, np.array(record, dtype=object), allow_pickle=True)
 
 
-def _scene(name: str, place: str, pose: Floats) -> dict[str, Any]:
+def _scene_configuration(name: str, place: str, pose: Floats) -> dict[str, Any]:
     folder = f"../../../processed_data/{name}"
     thing = {
         "type": "rigid_object",
@@ -113,7 +113,7 @@ def tabletop_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row
     }
 
 
-def tables_at(obj_pose: Floats) -> PlacedGrasps:
+def scenes_on_tables(obj_pose: Floats) -> PlacedGrasps:
     """Return scenes with the object at its poses (N, 7) on a table; equal poses share a scene."""
     _, first, index = np.unique(np.round(obj_pose / SAME), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -143,7 +143,7 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
     return {"obj_pose": pose, "obj_scale": float(scale[0])}
 
 
-def with_trajectory(
+def add_trajectory(
     hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> GraspSet:
     """Add approach and lift in the object's frame, if all rows have suitable ones.

@@ -14,17 +14,17 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from graspd.exchange.bench_hand import GRASPS, HandMapping, benchmark_mapping, body_names, mapping_of, write_hand
+from graspd.exchange.bench_hand import GRASPS, HandMapping, benchmark_mapping, body_names, load_mapping, write_hand
 from graspd.exchange.bench_scene import (
     SCALE,
     TABLETOP,
     Row,
+    add_trajectory,
     check_table,
     object_of_scene,
     save_record,
-    tables_at,
+    scenes_on_tables,
     tabletop_fields,
-    with_trajectory,
     write_object,
     write_table,
 )
@@ -49,16 +49,16 @@ def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
     files = [path] if path.is_file() else [f for f in sorted(path.rglob("*.npy")) if "scene_cfg" not in f.parts]
     if not files:
         raise InputError(f"{path} has no .npy files; DexGraspBench has one for each grasp")
-    mappings = {mapping_of(file) for file in files}
+    mappings = {load_mapping(file) for file in files}
     if len(mappings) > 1:
         names = ", ".join(sorted(one.config if one else "another" for one in mappings))
         raise InputError(f"{path} has grasps for {len(mappings)} models of a hand ({names}); give the folder of one")
     sets: dict[tuple[float, bool], list[Row]] = defaultdict(list)
     for file in files:
-        for row in _rows(file):
-            sets[_scale(row), _is_on_table(row)].append(row)
+        for row in _load_rows(file):
+            sets[_object_scale(row), _is_on_table(row)].append(row)
     model, mapping = hand_from_path(hand), mappings.pop()
-    return [_set(path, model, obj, sets[key], mapping) for key in sorted(sets)]
+    return [_imported_grasps(path, model, obj, sets[key], mapping) for key in sorted(sets)]
 
 
 def write(
@@ -130,7 +130,7 @@ def qpos_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: in
     return record
 
 
-def _rows(file: Path) -> list[Row]:
+def _load_rows(file: Path) -> list[Row]:
     """Return the grasps of a file: one, or K if `..._qpos` are (K, 7 + J)."""
     found = load_npy(file)
     if not isinstance(found, dict):
@@ -145,20 +145,20 @@ def _rows(file: Path) -> list[Row]:
     if count != {0}:
         if len(count) > 1:
             raise InputError(f"{file}: the numbers of pregrasps, grasps and squeezes differ")
-        rows = [{key: _part(value, k, count) for key, value in found.items()} for k in range(min(count))]
+        rows = [{key: _value_of_grasp(value, k, count) for key, value in found.items()} for k in range(min(count))]
     for row in rows:
         if "scene_scale" in row:
-            row["obj_scale"] = _scale(row) * float(np.ravel(row["scene_scale"])[0])
+            row["obj_scale"] = _object_scale(row) * float(np.ravel(row["scene_scale"])[0])
     return rows
 
 
-def _part(value: Any, k: int, count: set[int]) -> Any:
+def _value_of_grasp(value: Any, k: int, count: set[int]) -> Any:
     """Return grasp k's part of a value (K, ...); all grasps share other values."""
     each = isinstance(value, np.ndarray) and value.ndim > 0 and {len(value)} == count and value.dtype != object
     return value[k] if each else value
 
 
-def _scale(row: Row) -> float:
+def _object_scale(row: Row) -> float:
     return float(np.ravel(row.get("obj_scale", 1.0))[0])
 
 
@@ -166,9 +166,11 @@ def _is_on_table(row: Row) -> bool:
     return any(part.startswith(TABLETOP) for part in str(row.get("scene_path", "")).split("/"))
 
 
-def _set(path: Path, hand: HandModel, obj: str, rows: list[Row], mapping: HandMapping | None) -> ImportedGrasps:
+def _imported_grasps(
+    path: Path, hand: HandModel, obj: str, rows: list[Row], mapping: HandMapping | None
+) -> ImportedGrasps:
     """Return grasps of one scale, all of a free object or all on tables."""
-    scale = _scale(rows[0])
+    scale = _object_scale(rows[0])
     thing = scaled_object(obj, scale)
     pose = np.array([np.ravel(row.get("obj_pose", IDENTITY_POSE)) for row in rows], float)
 
@@ -189,7 +191,7 @@ def _set(path: Path, hand: HandModel, obj: str, rows: list[Row], mapping: HandMa
     grasps = GraspSet(grasp, pregrasp, squeeze, np.full(len(rows), np.nan))
     published = np.array([int(bool(row["succ_flag"])) if "succ_flag" in row else -1 for row in rows], np.int8)
     name = str(rows[0].get("obj_path", thing.name)).rstrip("/").rsplit("/", 1)[-1]
-    placed = tables_at(pose) if _is_on_table(rows[0]) else None
+    placed = scenes_on_tables(pose) if _is_on_table(rows[0]) else None
     if placed is not None:
-        grasps = replace(with_trajectory(hand, grasps, rows, pose, mapping), scene=placed.index)
+        grasps = replace(add_trajectory(hand, grasps, rows, pose, mapping), scene=placed.index)
     return ImportedGrasps(hand, thing, grasps, name, scale, published, placed)

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from graspd.exchange.imported import ImportedGrasps, add_postures, joints_by_name, parse_verdicts, scaled_object
-from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene, plain_name
+from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, group_by_scene, plain_name
 from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import (
@@ -83,12 +83,12 @@ class SceneGraspness:
     values: Floats  # (S,) graspness of the points, between 0 and K
 
     @classmethod
-    def of(cls, hand: HandModel, grasps: Posture, samples: Floats) -> SceneGraspness:
+    def from_grasps(cls, hand: HandModel, grasps: Posture, samples: Floats) -> SceneGraspness:
         """Compute the graspness from K grasps in the object's frame; without grasps all values are 0."""
         pointed = aim_points(*lines_of_sight(hand, grasps), samples)
         return cls(samples, pointed, sum_graspness(samples, pointed))
 
-    def of_view(
+    def picture_graspness(
         self, depth: Floats, labels: NDArray[np.uint8], intrinsics: Floats, camera: Floats, object_pose: Floats
     ) -> NDArray[np.float32]:
         """Return the graspness (N, 1) of a picture's points, as the loader makes and orders them.
@@ -201,7 +201,7 @@ def write(
     if top.exists():
         raise InputError(f"{top} exists already; give another folder as --output")
     known = {lot.id: lot for lot in lots}
-    seen = by_scene(pictures)
+    seen = group_by_scene(pictures)
     scenes = [some for some in seen if some[0].base in known and len(some[0].rows)]
     if not scenes:
         if any(some[0].base in known for some in seen):
@@ -218,7 +218,7 @@ def write(
         name = f"scene_{next(numbers[lot.name in out]):04}"
         if lot.id not in samples:
             samples[lot.id] = surface_samples(lot.obj)
-        graspness = SceneGraspness.of(lot.hand, lot.grasps.grasp.take(some[0].rows), samples[lot.id])
+        graspness = SceneGraspness.from_grasps(lot.hand, lot.grasps.grasp.take(some[0].rows), samples[lot.id])
         _write_scene(some[:VIEWS], pictures, top, name, noise, graspness)
         _write_grasps(some[0], lot, top / "dex_grasps_new" / name / plain_name(lot.hand.name), graspness)
         done.counts["grasps"] += len(some[0].rows)
@@ -265,7 +265,7 @@ def _write_scene(
         }
         scipy.io.savemat(path / "meta" / f"{view:04}.mat", meta)
         if labels.any():  # the loader skips empty views, which have no workspace
-            found = graspness.of_view(steps / FACTOR, labels, intrinsics, first @ poses[view], pose)
+            found = graspness.picture_graspness(steps / FACTOR, labels, intrinsics, first @ poses[view], pose)
             np.save(values / f"{view:04}.npy", found)
     # The loader samples among 256 views, so further views repeat the same files.
     for view in range(len(some), VIEWS):

@@ -42,8 +42,8 @@ def write(
     for lot in lots:
         if lot.placed is not None:
             check_table(lot.placed)
-    scenes = _scenes(lots, folder)
-    clouds, bare = _clouds(pictures, lots, scenes, folder, noise)
+    scenes = _write_scenes(lots, folder)
+    clouds, bare = _write_clouds(pictures, lots, scenes, folder, noise)
     done = ExportSummary({"grasps": 0, "scenes": len({*scenes.values()}), "clouds": clouds, "files": 0})
     if not clouds:
         done.notes.append("there are no pictures and so no clouds; render views into the grasps' folder: graspd render")
@@ -69,7 +69,7 @@ _Scenes = dict[tuple[str, int], Path]
 _Part = tuple[ExportPart, Path, int, NDArray[np.intp]]
 
 
-def _scenes(lots: Sequence[ExportPart], folder: Path) -> _Scenes:
+def _write_scenes(lots: Sequence[ExportPart], folder: Path) -> _Scenes:
     scenes: _Scenes = {}
     free: dict[str, Path] = {}
     count = Counter[str]()
@@ -86,7 +86,7 @@ def _scenes(lots: Sequence[ExportPart], folder: Path) -> _Scenes:
     return scenes
 
 
-def _clouds(
+def _write_clouds(
     pictures: Pictures, lots: Sequence[ExportPart], scenes: _Scenes, folder: Path, noise: DepthNoise | None
 ) -> tuple[int, int]:
     """Write the object's cloud of each picture; return the numbers of clouds and of scenes without cloud."""
@@ -94,7 +94,7 @@ def _clouds(
     written = Counter[Path]()
     for look in pictures_without_pixels(pictures):
         scene = scenes.get((look.base, look.scene if on_table.get(look.base) else _FREE))
-        if scene is None or not len(points := points_of(pictures, look, noise, on_table=on_table[look.base])):
+        if scene is None or not len(points := object_points(pictures, look, noise, on_table=on_table[look.base])):
             continue
         place = folder / VISION / scene.relative_to(SET / "scene_cfg").with_suffix("")
         place.mkdir(parents=True, exist_ok=True)
@@ -107,7 +107,7 @@ def _clouds(
     return written.total(), len(bare)
 
 
-def points_of(pictures: Pictures, look: PictureReference, noise: DepthNoise | None, *, on_table: bool) -> Floats:
+def object_points(pictures: Pictures, look: PictureReference, noise: DepthNoise | None, *, on_table: bool) -> Floats:
     """Return the object's points (P, 3) in a picture [m], in the frame of the table or of the free object."""
     view = CloudView(pictures[look.index], noise, np.random.default_rng(look.index))
     points = view.points(*view.pixels(whole=False))
@@ -118,20 +118,20 @@ def _write_group(
     lots: list[ExportPart], scenes: _Scenes, folder: Path, out: frozenset[str], done: ExportSummary, *, seen: bool
 ) -> None:
     parts = [(lot, *part) for lot in lots for part in _rows_of(lot, scenes, folder, seen=seen)]
-    listed = sorted({kind for _, _, kind, _ in parts if _in_both(kind, parts, out)})
+    listed = sorted({kind for _, _, kind, _ in parts if _is_in_both_splits(kind, parts, out)})
     if not listed:
         # Without a type that has objects in both splits, all grasps get one type.
-        parts, listed = [(lot, scene, 0, rows) for lot, scene, rows in _untyped(parts)], [0]
+        parts, listed = [(lot, scene, 0, rows) for lot, scene, rows in _merge_types(parts)], [0]
     done.counts["grasps"] += sum(len(rows) for *_, rows in parts)
     for mapping in write_models(lots[0].hand, folder):
         name = f"{experiment_name(lots[0].placed)}_{mapping.config}"
         top = folder / "assets" / "grasp" / name
         mapping.write(top)
         for lot, scene, kind, rows in parts:
-            file = top / COLLECTED / TYPES[kind] / lot.name / scene.parent.name / f"{scene.stem}_{lot.tag}.npy"
+            file = top / COLLECTED / TYPES[kind] / lot.name / scene.parent.name / f"{scene.stem}_{lot.id_hash}.npy"
             save_record(file, _record(mapping, lot, rows, scene))
         done.counts["files"] += len(parts)
-        _configure(folder, name, lots[0], [TYPES[kind] for kind in listed])
+        _write_configuration(folder, name, lots[0], [TYPES[kind] for kind in listed])
 
 
 def _rows_of(
@@ -149,13 +149,13 @@ def _rows_of(
             yield path, int(kind), rows[types[rows] == kind]
 
 
-def _in_both(kind: int, parts: Sequence[_Part], out: frozenset[str]) -> bool:
+def _is_in_both_splits(kind: int, parts: Sequence[_Part], out: frozenset[str]) -> bool:
     """Check whether a type has objects in both splits, as DexLearn needs it."""
     names = {lot.name for lot, _, other, _ in parts if other == kind}
     return not out or bool(names & out and names - out)
 
 
-def _untyped(parts: Sequence[_Part]) -> Iterator[tuple[ExportPart, Path, NDArray[np.intp]]]:
+def _merge_types(parts: Sequence[_Part]) -> Iterator[tuple[ExportPart, Path, NDArray[np.intp]]]:
     together: dict[tuple[str, Path], list[_Part]] = defaultdict(list)
     for part in parts:
         together[part[0].id, part[1]].append(part)
@@ -174,7 +174,7 @@ def _record(mapping: HandMapping, lot: ExportPart, rows: NDArray[np.intp], scene
     return record | {"succ_flag": lot.verdict[rows], "row": np.asarray(rows)}
 
 
-def _configure(folder: Path, name: str, lot: ExportPart, types: list[str]) -> None:
+def _write_configuration(folder: Path, name: str, lot: ExportPart, types: list[str]) -> None:
     values: dict[str, Any] = {
         "num_workers": 8,
         "num_points": POINTS,

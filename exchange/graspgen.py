@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from graspd.baselines.autograsp import kernels
 from graspd.baselines.autograsp.method import HandCloser
 from graspd.baselines.common import load_pair
-from graspd.exchange.imported import ImportedGrasps, add_postures, joints_by_name, mesh_file, scaled_object
+from graspd.exchange.imported import ImportedGrasps, add_postures, joints_by_name, scaled_object, write_mesh
 from graspd.exchange.plan import ExportPart, ExportSummary, plain_name
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, apply, pose_from_matrix, pose_to_matrix, quat_from_matrix
@@ -52,8 +52,8 @@ def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> Expo
     meshes = {uuid_of(lot): lot.obj for lot in lots}
     (folder / "objects").mkdir(parents=True, exist_ok=True)
     for uuid, obj in meshes.items():
-        mesh_file(obj, folder / "objects" / f"{uuid}.obj")
-    _json(folder / "objects" / "map_uuid_to_path.json", {uuid: f"{uuid}.obj" for uuid in meshes})
+        write_mesh(obj, folder / "objects" / f"{uuid}.obj")
+    _write_json(folder / "objects" / "map_uuid_to_path.json", {uuid: f"{uuid}.obj" for uuid in meshes})
     held = {uuid_of(lot) for lot in lots if lot.name in out}
     for hand in {lot.hand.digest: lot.hand for lot in lots}.values():
         _write_hand(hand, [lot for lot in lots if lot.hand.digest == hand.digest], folder, held, done)
@@ -81,7 +81,7 @@ def _write_hand(hand: HandModel, lots: list[ExportPart], folder: Path, out: set[
                 tar.addfile(entry, io.BytesIO(data))
                 index[uuid] = number
         done.counts["files"] += 1
-    _json(folder / "grasps" / name / INDEX, index)
+    _write_json(folder / "grasps" / name / INDEX, index)
     (folder / "splits" / name).mkdir(parents=True, exist_ok=True)
     if not out:
         done.notes.append("only one object, in both train.txt and valid.txt")
@@ -143,7 +143,7 @@ def gripper_convention(hand: HandModel) -> dict[str, Any]:
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
     """Read an object's record from a JSON file, a tar or a folder of tars.
     Fingers of a record without joints close until contact. Raises InputError: the record is missing or invalid."""
-    file, record = _found(path, object_name)
+    file, record = _find_record(path, object_name)
     try:
         scale, grasps = float(record["object"]["scale"]), record["grasps"]
         matrices = np.asarray(grasps["transforms"], float)
@@ -159,12 +159,12 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
         raise InputError(f"{file} has an object of scale {scale:g}")
     model, thing = hand_from_path(hand), scaled_object(obj, scale)
     pose = pose_from_matrix(matrices)
-    made = _grasps(file, model, record, pose) or add_postures(model, thing, close_hands_at(model, thing, pose))
+    made = _stored_grasps(file, model, record, pose) or add_postures(model, thing, close_hands_at(model, thing, pose))
     name = object_name or Path(str(record["object"].get("file", ""))).stem or thing.name
     return [ImportedGrasps(model, thing, made, name, scale, held.astype(np.int8))]
 
 
-def _grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) -> GraspSet | None:
+def _stored_grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) -> GraspSet | None:
     grasps, names = record["grasps"], record.get("gripper", {}).get("joint_names")
     if not names or not all(f"{name}_joints" in grasps for name in POSTURES):
         return None
@@ -178,11 +178,11 @@ def _grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) ->
     return GraspSet(parts[1], parts[0], parts[2], np.full(len(pose), np.nan))
 
 
-def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
+def _find_record(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
     if path.suffix == ".json":
         try:
             with path.open("rb") as stream:
-                return str(path), _parsed(str(path), stream.read(LARGEST + 1))
+                return str(path), _parse_record(str(path), stream.read(LARGEST + 1))
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}") from None
     files = sorted(path.glob("*.tar")) if path.is_dir() else [path]
@@ -200,7 +200,7 @@ def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
                     if found is None and uuid in ("", key):
                         content = tar.extractfile(member)
                         assert content is not None, "a plain file has content"
-                        found = f"{file}: {key}", _parsed(f"{file}: {key}", content.read(LARGEST + 1))
+                        found = f"{file}: {key}", _parse_record(f"{file}: {key}", content.read(LARGEST + 1))
         except (OSError, tarfile.TarError) as error:
             raise InputError(f"{file} is no tar file: {error}") from None
     if found is None or (not uuid and len(names) > 1):
@@ -209,7 +209,7 @@ def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
     return found
 
 
-def _parsed(what: str, data: bytes) -> dict[str, Any]:
+def _parse_record(what: str, data: bytes) -> dict[str, Any]:
     if len(data) > LARGEST:
         raise InputError(f"{what} is larger than {LARGEST >> 20} MiB, too large for a record")
     try:
@@ -221,7 +221,7 @@ def _parsed(what: str, data: bytes) -> dict[str, Any]:
     return record
 
 
-def _json(path: Path, value: Any) -> None:
+def _write_json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=1) + "\n")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from graspd.exchange.bench_scene import tables_at
+from graspd.exchange.bench_scene import scenes_on_tables
 from graspd.exchange.imported import ImportedGrasps, joints_by_name, parse_verdicts, scaled_object
 from graspd.exchange.plan import ExportPart, ExportSummary
 from graspd.service import parquet
@@ -32,7 +32,7 @@ POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Values of column `scene_kind` that `read` supports.
 FREE: Final = "free"
 TABLE: Final = "table"
-#: Columns of grasps, with the names of their types in `parquet.type_of`.
+#: Columns of grasps, with the names of their types in `parquet.arrow_type`.
 GRASPS: Final = {
     "hand": "text",
     "object": "text",
@@ -76,7 +76,7 @@ def write(
 ) -> ExportSummary:
     """Write both tables, each with splits `train` and `test`; held-out objects are in `test`.
     Raises InputError: `folder` has such tables already, or pyarrow is missing."""
-    parquet.arrow()
+    parquet.import_pyarrow()
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds a table of grasps already; give another folder as --output")
     done = ExportSummary({"grasps": 0, "pictures": 0, "files": 0})
@@ -87,12 +87,12 @@ def write(
             continue
         mine = [lot for lot in lots if lot.name in some]
         file = folder / "grasps" / f"{split}-00000.parquet"
-        done.counts["grasps"] += parquet.write(file, parquet.schema_of(GRASPS), map(_grasps, mine))
+        done.counts["grasps"] += parquet.write(file, parquet.arrow_schema(GRASPS), map(_grasps, mine))
         done.counts["files"] += 1
         if len(pictures):
             file = folder / "pictures" / f"{split}-00000.parquet"
             groups = _groups(pictures, {lot.id: lot.name for lot in mine}, noise)
-            done.counts["pictures"] += parquet.write(file, parquet.schema_of(PICTURES), groups)
+            done.counts["pictures"] += parquet.write(file, parquet.arrow_schema(PICTURES), groups)
             done.counts["files"] += 1
     splits = [split for split, some in sides.items() if some]
     tables = [
@@ -211,10 +211,14 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
             f"{path} has grasps for scenes of the kind {sorted(other)[0]!r}; only table and free are supported"
         )
     sets = {kind: [k for k in rows if kinds[k] == kind] for kind in (FREE, TABLE)}
-    return [_set(path, hand, obj, wanted, columns, some, on_table=kind == TABLE) for kind, some in sets.items() if some]
+    return [
+        _imported_grasps(path, hand, obj, wanted, columns, some, on_table=kind == TABLE)
+        for kind, some in sets.items()
+        if some
+    ]
 
 
-def _set(
+def _imported_grasps(
     path: Path, hand: str, obj: str, name: str, columns: dict[str, list[Any]], rows: list[int], *, on_table: bool
 ) -> ImportedGrasps:
     model, thing = hand_from_path(hand), scaled_object(obj)
@@ -231,7 +235,7 @@ def _set(
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"{path} is no table of grasps: {error}") from None
     grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], np.full(len(rows), np.nan))
-    placed = None if place is None else tables_at(place)
+    placed = None if place is None else scenes_on_tables(place)
     if placed is not None:
         grasps.scene = placed.index
     return ImportedGrasps(model, thing, grasps, name, 1.0, verdict, placed)

@@ -80,7 +80,7 @@ def scaled_object(path: str | Path, scale: float = 1.0) -> ObjectModel:
     return object_from_path(path, options={"units": "m", "scale_to": extent * scale})
 
 
-def mesh_file(obj: ObjectModel, path: Path) -> Path:
+def write_mesh(obj: ObjectModel, path: Path) -> Path:
     """Write the object's prepared mesh as an OBJ file, which all readers support."""
     return write_obj(path, obj.vertices, obj.faces, f"{obj.name}, metres")
 
@@ -94,7 +94,7 @@ def write_obj(path: Path, vertices: Any, faces: Any, comment: str = "metres") ->
     return path
 
 
-def urdf_of(name: str, link: str, meshes: Sequence[str]) -> str:
+def urdf_text(name: str, link: str, meshes: Sequence[str]) -> str:
     """Return the URDF of one link made of meshes."""
     lines = [f'<robot name="{name}">', f'  <link name="{link}">']
     for mesh in meshes:
@@ -115,7 +115,7 @@ _HARMLESS: Final = {
 }
 
 
-class _Reader(pickle.Unpickler):
+class _SafeUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _HARMLESS:
             raise pickle.UnpicklingError(f"it would run {module}.{name}")
@@ -133,7 +133,7 @@ def load_npy(path: Path) -> Any:
                 if "Object arrays" not in str(error):
                     raise
             # The stream is now after the header, at the pickle.
-            found = _Reader(file).load()
+            found = _SafeUnpickler(file).load()
     except pickle.UnpicklingError as error:
         raise InputError(f"{path} cannot be read safely: {error}") from None
     except Exception as error:  # an untrusted pickle may raise anything

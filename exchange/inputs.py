@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from graspd.exchange import dexgraspbench, published
 from graspd.service.model.errors import InputError, NotFoundError
-from graspd.service.store.shards import kind_of, open_shard, read_shard
+from graspd.service.store.shards import open_shard, read_shard, shard_kind
 from graspd.worker.files.provenance import hand_of_shard, object_of_shard, scenes_of_shard
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
@@ -62,7 +62,7 @@ def expand_path(path: Path) -> list[Path]:
 def _is_scene_file(path: Path) -> bool:
     """Check whether a file is a scene or views shard, which has no grasps of its own."""
     with open_shard(path) as file:
-        return kind_of(file, str(path)) != "base"
+        return shard_kind(file, str(path)) != "base"
 
 
 def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) -> Case:
@@ -70,17 +70,17 @@ def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) ->
     `hand` (URDF or built-in) and `obj` (mesh or built-in) replace hand and object of the file. Raises NotFoundError:
     the path does not exist; InputError: the file is invalid or of another hand."""
     if path.is_dir():
-        return _bench_folder(path, hand, obj)
+        return _load_bench_folder(path, hand, obj)
     if not path.is_file():
         raise NotFoundError(f"{path} does not exist")
     if path.suffix != ".json":
-        return _shard(path, hand, obj)
+        return _load_shard(path, hand, obj)
     (found,) = published.read_reference(path, hand=hand, obj=obj)
-    friction = published.friction(path)
+    friction = published.stored_friction(path)
     return Case(path.name, found.hand, found.obj, found.grasps, friction=friction, published=found.published)
 
 
-def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
+def _load_shard(path: Path, hand: str | None, obj: str | None) -> Case:
     shard = read_shard(path, kind="base")
     model, thing = hand_of_shard(shard, hand), object_of_shard(shard, obj)
     grasps = GraspSet.from_columns(shard.arrays)
@@ -99,7 +99,7 @@ def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
     )
 
 
-def _bench_folder(path: Path, hand: str | None, obj: str | None) -> Case:
+def _load_bench_folder(path: Path, hand: str | None, obj: str | None) -> Case:
     if hand is None or obj is None:
         raise InputError("a DexGraspBench folder does not contain hand and object; name both: --hand and --object")
     sets = dexgraspbench.read(path, hand=hand, obj=obj)

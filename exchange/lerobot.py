@@ -13,10 +13,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.exchange.bench_scene import tables_at
+from graspd.exchange.bench_scene import scenes_on_tables
 from graspd.exchange.huggingface import png
 from graspd.exchange.imported import ImportedGrasps, joints_by_name, parse_verdicts, scaled_object
-from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene
+from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, group_by_scene
 from graspd.service import parquet
 from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
@@ -59,7 +59,7 @@ _INDEXED: Final = {
 def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str]) -> ExportSummary:
     """Write an episode per grasp, with a picture of its scene (round-robin); held-out objects come last.
     Raises InputError: no picture shows a grasp planned in a scene, or hands or picture sizes differ."""
-    parquet.arrow()
+    parquet.import_pyarrow()
     if (folder / "meta").exists():
         raise InputError(f"{folder} holds a data set already; give another folder as --output")
     if len({lot.hand.digest for lot in lots}) > 1:
@@ -69,7 +69,7 @@ def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: fro
     ways = [lot for lot in sorted(lots, key=lambda lot: lot.name in out) if lot.placed is not None]
     if not ways:
         raise InputError("free grasps have no approach; plan grasps in a scene: --scene table")
-    seen = {(some[0].base, some[0].scene): some for some in by_scene(pictures)}
+    seen = {(some[0].base, some[0].scene): some for some in group_by_scene(pictures)}
     episodes = [(lot, row, look) for lot in ways for row, look in _pictured_rows(lot, seen)]
     if not episodes:
         raise InputError("no picture shows the scene of a grasp; render views into the grasps' folder: graspd render")
@@ -119,7 +119,7 @@ class _Writer:
         chunk, file = divmod(number, _FILES)
         place = {"data/chunk_index": chunk, "data/file_index": file}
         path = self.folder / "data" / f"chunk-{chunk:03}" / f"file-{file:03}.parquet"
-        parquet.write(path, parquet.schema_of(columns), (self._episode(*one, place) for one in episodes))
+        parquet.write(path, parquet.arrow_schema(columns), (self._episode(*one, place) for one in episodes))
 
     def _episode(
         self, lot: ExportPart, row: int, look: PictureReference, place: Mapping[str, int]
@@ -146,7 +146,7 @@ class _Writer:
         self.episodes.append(
             {
                 EPISODE: number,
-                "tasks": [task_of(lot.name)],
+                "tasks": [task_text(lot.name)],
                 "length": count,
                 **place,
                 "dataset_from_index": self.frames,
@@ -188,13 +188,13 @@ class _Writer:
         (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n")
         stats = {key: _statistics(np.concatenate(some), picture=key == PICTURE) for key, some in self._values.items()}
         (meta / "stats.json").write_text(json.dumps(stats, indent=4) + "\n")
-        schema = parquet.schema_of({"task_index": "int64", "task": "text"}, {"pandas": json.dumps(_INDEXED)})
-        rows = [{"task_index": number, "task": task_of(name)} for name, number in self.tasks.items()]
+        schema = parquet.arrow_schema({"task_index": "int64", "task": "text"}, {"pandas": json.dumps(_INDEXED)})
+        rows = [{"task_index": number, "task": task_text(name)} for name, number in self.tasks.items()]
         parquet.write(meta / "tasks.parquet", schema, [rows])
         words = {"tasks": "text[]", "graspd/shard": "text"}
         columns = {name: words.get(name, "int64") for name in self.episodes[0]}
         path = meta / "episodes" / "chunk-000" / "file-000.parquet"
-        parquet.write(path, parquet.schema_of(columns), [self.episodes])
+        parquet.write(path, parquet.arrow_schema(columns), [self.episodes])
 
     def _features(self) -> dict[str, Any]:
         names = [*POSE_PARTS, *self.hand.joint_names]
@@ -208,7 +208,7 @@ class _Writer:
         }
 
 
-def task_of(name: str) -> str:
+def task_text(name: str) -> str:
     return f"lift the {name}"
 
 
@@ -228,8 +228,8 @@ _LARGEST = 2**22  # largest size of `info.json` [bytes]
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
     """Read one object's grasps on tables, with approaches if all have the same number of waypoints.
     Raises InputError: files are invalid or not from graspd, or `object_name` selects no single object."""
-    names = _names(path)
-    task = _task(path, object_name)
+    names = _read_joint_names(path)
+    task = _find_task(path, object_name)
     ways, rest, numbers = _trajectories(path, task)
     if not len(ways) or min(map(len, ways)) < _STOPS:
         raise InputError(f"{path} has no episodes of task {task} with a complete trajectory")
@@ -243,7 +243,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
 
     pregrasp, grasp, squeeze, lift = (posture(np.array([way[k] for way in ways])) for k in range(-_STOPS, 0))
     grasps = GraspSet(grasp, pregrasp, squeeze, np.full(len(ways), np.nan))
-    placed = tables_at(rest)
+    placed = scenes_on_tables(rest)
     grasps.scene, grasps.lift = placed.index, lift
     if len({len(way) for way in ways}) == 1 and len(ways[0]) > _STOPS:
         coming = [posture(np.array([way[k] for way in ways])) for k in range(len(ways[0]) - _STOPS)]
@@ -252,7 +252,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
     return [ImportedGrasps(model, thing, grasps, object_name or thing.name, 1.0, _verdicts(path, numbers), placed)]
 
 
-def _names(path: Path) -> list[str]:
+def _read_joint_names(path: Path) -> list[str]:
     file = path / "meta" / "info.json"
     try:
         with file.open("rb") as stream:
@@ -264,14 +264,14 @@ def _names(path: Path) -> list[str]:
     return names[7:]
 
 
-def _task(path: Path, object_name: str) -> int:
+def _find_task(path: Path, object_name: str) -> int:
     found = parquet.read(path / "meta" / "tasks.parquet", ("task", "task_index"))
     words, numbers = found.get("task", []), found.get("task_index", [])
     if not object_name and len(numbers) == 1:
         return int(numbers[0])
-    if task_of(object_name) not in words:
+    if task_text(object_name) not in words:
         raise InputError(f"{path} has the tasks {', '.join(map(str, words[:8]))}; select one object: --name")
-    return int(numbers[words.index(task_of(object_name))])
+    return int(numbers[words.index(task_text(object_name))])
 
 
 def _trajectories(path: Path, task: int) -> tuple[list[Floats], Floats, list[int]]:

@@ -18,20 +18,20 @@ import yaml
 from PIL import Image
 
 from graspd.service.model.errors import GraspdError
-from graspd.service.parquet import arrow
+from graspd.service.parquet import import_pyarrow
 
 
 @contextmanager
 def check_written_files(folder: Path) -> Iterator[None]:
     """Open all files that this context writes to a folder. Raises GraspdError: a library cannot read one."""
-    before = _stamps(folder)
+    before = _file_stamps(folder)
     yield
-    for path, stamp in sorted(_stamps(folder).items()):
+    for path, stamp in sorted(_file_stamps(folder).items()):
         if before.get(path) != stamp and (reader := READERS.get(path.suffix)):
             _open(path, *reader)
 
 
-def _stamps(folder: Path) -> dict[Path, tuple[int, int]]:
+def _file_stamps(folder: Path) -> dict[Path, tuple[int, int]]:
     """Return time of change and size of each file."""
     found = ((path, path.stat()) for path in folder.rglob("*") if path.is_file())
     return {path: (stat.st_mtime_ns, stat.st_size) for path, stat in found}
@@ -49,7 +49,7 @@ def _open(path: Path, library: str, read: Callable[[Path], Any]) -> None:
         ) from error
 
 
-def _stage(path: Path) -> None:
+def _check_usd(path: Path) -> None:
     from pxr import Usd
 
     stage = Usd.Stage.Open(str(path))
@@ -57,35 +57,35 @@ def _stage(path: Path) -> None:
         raise ValueError("it has no default prim")
 
 
-def _mesh(path: Path) -> None:
+def _check_mesh(path: Path) -> None:
     import trimesh
 
     if trimesh.load_scene(path, process=False).is_empty:
         raise ValueError("it is empty")
 
 
-def _rows(path: Path) -> None:
+def _check_csv(path: Path) -> None:
     with path.open(newline="", encoding="utf-8") as file:
         if len({len(row) for row in csv.reader(file)}) != 1:
             raise ValueError("its rows have different lengths")
 
 
-def _hdf5(path: Path) -> None:
+def _check_hdf5(path: Path) -> None:
     with h5py.File(path) as file:
         file.visititems(lambda _, item: item[()] if isinstance(item, h5py.Dataset) else None)
 
 
-def _tar(path: Path) -> None:
+def _check_tar(path: Path) -> None:
     with tarfile.open(path) as file:
         file.getnames()
 
 
-def _picture(path: Path) -> None:
+def _check_png(path: Path) -> None:
     with Image.open(path) as image:
         image.verify()
 
 
-def _depth(path: Path) -> None:
+def _check_exr(path: Path) -> None:
     import OpenEXR
 
     with OpenEXR.File(str(path)) as file:
@@ -96,20 +96,20 @@ def _depth(path: Path) -> None:
 READERS: Final[dict[str, tuple[str, Callable[[Path], Any]]]] = {
     ".xml": ("mujoco", lambda path: import_module("mujoco").MjModel.from_xml_path(str(path))),
     ".urdf": ("an XML parser", ElementTree.parse),
-    ".usd": ("pxr", _stage),
-    ".glb": ("trimesh", _mesh),
-    ".obj": ("trimesh", _mesh),
-    ".stl": ("trimesh", _mesh),
+    ".usd": ("pxr", _check_usd),
+    ".glb": ("trimesh", _check_mesh),
+    ".obj": ("trimesh", _check_mesh),
+    ".stl": ("trimesh", _check_mesh),
     ".yaml": ("PyYAML", lambda path: yaml.load(path.read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader))),
     ".json": ("json", lambda path: json.loads(path.read_bytes())),
     ".jsonl": ("json", lambda path: [json.loads(line) for line in path.read_text().splitlines()]),
-    ".csv": ("csv", _rows),
+    ".csv": ("csv", _check_csv),
     # Pickles, which DexGraspBench has, are safe here, since graspd has just written the file.
     ".npy": ("NumPy", lambda path: np.load(path, allow_pickle=True)),
     ".npz": ("NumPy", np.load),
-    ".h5": ("h5py", _hdf5),
-    ".parquet": ("pyarrow", lambda path: arrow().parquet.ParquetFile(path).read_row_group(0)),
-    ".tar": ("tarfile", _tar),
-    ".png": ("Pillow", _picture),
-    ".exr": ("OpenEXR", _depth),
+    ".h5": ("h5py", _check_hdf5),
+    ".parquet": ("pyarrow", lambda path: import_pyarrow().parquet.ParquetFile(path).read_row_group(0)),
+    ".tar": ("tarfile", _check_tar),
+    ".png": ("Pillow", _check_png),
+    ".exr": ("OpenEXR", _check_exr),
 }

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.names import shorten
+from graspd.service.model.names import shorten_name
 from graspd.service.model.transforms import Floats, compose, invert, pose_from_matrix
 from graspd.service.readers import Pictures
 from graspd.service.store.shards import Shard
@@ -38,7 +38,7 @@ class ExportPart:
     placed: PlacedGrasps | None = None
 
     @property
-    def tag(self) -> str:
+    def id_hash(self) -> str:
         """Part of file names that distinguishes shards of one object."""
         return hashlib.sha256(self.id.encode()).hexdigest()[:8]
 
@@ -81,7 +81,7 @@ def pictures_without_pixels(pictures: Pictures) -> Iterator[PictureReference]:
 RIGHT: Final = 2  # value of `camera/eye` for the right picture of a stereo pair
 
 
-def by_scene(pictures: Pictures) -> list[list[PictureReference]]:
+def group_by_scene(pictures: Pictures) -> list[list[PictureReference]]:
     """Return the pictures of each scene of each views shard."""
     scenes: dict[tuple[str, int], list[PictureReference]] = defaultdict(list)
     for look in pictures_without_pixels(pictures):
@@ -100,7 +100,7 @@ class ExportSummary:
 
 def plain_name(name: str) -> str:
     """Return a name fit for files and URLs; long names are cut, with a log message."""
-    return shorten(re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "unnamed")
+    return shorten_name(re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "unnamed")
 
 
 def prim_name(name: str) -> str:

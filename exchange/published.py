@@ -68,12 +68,12 @@ def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Impor
         raise InputError(f"{path}: object {number} has grasps of shape {place.shape} and joints of {values.shape}")
     model, thing = hand_from_path(hand), scaled_object(obj)
     pose = np.concatenate([place[:, :3], place[:, 6:], place[:, 3:6]], axis=1)
-    names = _names(model)
-    grasp = Posture(pose, joints_by_name(model, names, values * _signs(model, names), what=str(path)))
+    names = _barrett_joint_names(model)
+    grasp = Posture(pose, joints_by_name(model, names, values * _closing_signs(model, names), what=str(path)))
     return [ImportedGrasps(model, thing, add_postures(model, thing, grasp), thing.name)]
 
 
-def _names(hand: HandModel) -> list[str]:
+def _barrett_joint_names(hand: HandModel) -> list[str]:
     names = []
     for role in ROLES:
         found = [name for name in hand.joint_names if re.search(role, name)]
@@ -83,7 +83,7 @@ def _names(hand: HandModel) -> list[str]:
     return names
 
 
-def _signs(hand: HandModel, names: list[str]) -> Floats:
+def _closing_signs(hand: HandModel, names: list[str]) -> Floats:
     """Return the sign of each joint's closing: -1 if it closes towards negative angles, else 1."""
     order = [hand.joint_names.index(name) for name in names]
     ends = np.array([hand.expand(limit[None])[0][order] for limit in (hand.lower, hand.upper)])
@@ -108,12 +108,12 @@ def read_dexgraspnet(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]
     sets = []
     for scale, some in sorted(by_scale.items()):
         thing = scaled_object(obj, scale)
-        grasps = add_postures(model, thing, _grasp(path, model, some))
+        grasps = add_postures(model, thing, _read_postures(path, model, some))
         sets.append(ImportedGrasps(model, thing, grasps, path.stem, scale))
     return sets
 
 
-def _grasp(path: Path, hand: HandModel, rows: list[dict[str, Any]]) -> Posture:
+def _read_postures(path: Path, hand: HandModel, rows: list[dict[str, Any]]) -> Posture:
     try:
         place = np.array([[row["qpos"][name] for name in _TRANSLATION] for row in rows], float)
         angles = np.array([[row["qpos"][name] for name in _ROTATION] for row in rows], float)
@@ -185,7 +185,7 @@ def _metadata(path: Path) -> list[Any]:
 
 def read_reference(path: Path, *, hand: str | None = None, obj: str | None = None) -> list[ImportedGrasps]:
     """Read the grasps of one file; hand and object default to the names in the file."""
-    stored = _stored(path)
+    stored = _read_json_object(path)
     try:
         rows = stored["grasps"]
         # The set's root contains hands/, objects/ and reference_grasps/.
@@ -202,13 +202,13 @@ def read_reference(path: Path, *, hand: str | None = None, obj: str | None = Non
     return [ImportedGrasps(model, thing, grasps, str(stored["object"]), published=published)]
 
 
-def friction(path: Path) -> float | None:
+def stored_friction(path: Path) -> float | None:
     """Return the Coulomb coefficient of the file's metrics; None if it is not stated."""
-    value = _stored(path).get("contact_model", {}).get("mu")
+    value = _read_json_object(path).get("contact_model", {}).get("mu")
     return None if value is None else float(value)
 
 
-def _stored(path: Path) -> dict[str, Any]:
+def _read_json_object(path: Path) -> dict[str, Any]:
     try:
         found = from_json(path.read_bytes())
     except (OSError, ValueError) as error:

@@ -41,7 +41,7 @@ def write(views: Shard, folder: Path) -> list[Path]:
     written = export_images(views, folder, depth="exr")
     name = str(views.attributes.get("object", "object"))
     for view in range(len(views["camera/eye"])):
-        written += _annotations(views, view, name, folder)
+        written += _write_annotations(views, view, name, folder)
     return written
 
 
@@ -83,7 +83,7 @@ def camera_params(views: Shard, view: int) -> dict[str, Any]:
     }
 
 
-def _annotations(views: Shard, view: int, name: str, folder: Path) -> list[Path]:
+def _write_annotations(views: Shard, view: int, name: str, folder: Path) -> list[Path]:
     hidden = np.asarray(views.arrays.get("box/occlusion_ratio", np.full(view + 1, np.nan)), float)[view]
     boxes: dict[str, NDArray[Any]] = {}
     for kind in ("tight", "loose"):
@@ -95,18 +95,20 @@ def _annotations(views: Shard, view: int, name: str, folder: Path) -> list[Path]
         np.asarray(views["box/bounding_box_3d"][view], float), np.asarray(views["camera/extrinsics"][view], float)
     )
     boxes["bounding_box_3d"] = np.array([(0, *low, *high, transform, hidden)], _BOX_3D)
-    written = [_json(folder / f"camera_params_{view:04}.json", camera_params(views, view))]
+    written = [_write_json(folder / f"camera_params_{view:04}.json", camera_params(views, view))]
     for what, rows in boxes.items():
         np.save(folder / f"{what}_{view:04}.npy", rows)
         written.append(folder / f"{what}_{view:04}.npy")
-        written.append(_json(folder / f"{what}_labels_{view:04}.json", {"0": {"class": name}}))
-        written.append(_json(folder / f"{what}_prim_paths_{view:04}.json", [f"/World/{prim_name(name)}"] * len(rows)))
+        written.append(_write_json(folder / f"{what}_labels_{view:04}.json", {"0": {"class": name}}))
+        written.append(
+            _write_json(folder / f"{what}_prim_paths_{view:04}.json", [f"/World/{prim_name(name)}"] * len(rows))
+        )
     labels = {BACKGROUND: "BACKGROUND", TABLE: "table", OBJECT: name}
     said = {str(label): {"class": word} for label, word in labels.items()}
-    written.append(_json(folder / f"semantic_segmentation_labels_{view:04}.json", said))
+    written.append(_write_json(folder / f"semantic_segmentation_labels_{view:04}.json", said))
     return written
 
 
-def _json(path: Path, value: Any) -> Path:
+def _write_json(path: Path, value: Any) -> Path:
     path.write_text(json.dumps(value) + "\n")
     return path

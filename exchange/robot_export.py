@@ -16,15 +16,15 @@ from graspd.exchange.robots.execution import (
     ASSUMED_M_S,
     ASSUMED_RAD_S,
     Executions,
-    Limits,
-    executions,
-    hand_limits,
+    VelocityLimits,
+    build_executions,
     parse_pose,
     straight_paths,
     time_motions,
     tool_frame,
+    velocity_limits,
 )
-from graspd.exchange.robots.reach import Description, ReachSearch, read_arm, read_description
+from graspd.exchange.robots.reach import HandDescription, ReachSearch, read_arm, read_description
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.service.store.shards import Shard, read_shard
@@ -66,7 +66,7 @@ def export_grasps(source: Path, format_: str, wishes: RobotExportOptions, folder
     description = read_description(files.files, files.options)
     written = ExportSummary({})
     found = _plan_executions(source, shard, description, wishes, written)
-    limits = hand_limits(found.hand)
+    limits = velocity_limits(found.hand)
     written.notes += _assumptions(limits)
     if wishes.arm is None:
         found = found.take(np.arange(len(found))[: wishes.best or None])
@@ -83,14 +83,18 @@ def export_grasps(source: Path, format_: str, wishes: RobotExportOptions, folder
 
 
 def _plan_for_arm(
-    found: Executions, description: Description, limits: Limits, wishes: RobotExportOptions, written: ExportSummary
+    found: Executions,
+    description: HandDescription,
+    limits: VelocityLimits,
+    wishes: RobotExportOptions,
+    written: ExportSummary,
 ) -> Bundle:
     assert wishes.arm is not None and wishes.mount is not None
     base = IDENTITY_POSE if wishes.base is None else parse_pose(wishes.base, "--base")
     mount_pose = IDENTITY_POSE if wishes.mount_pose is None else parse_pose(wishes.mount_pose, "--mount-pose")
     arm = read_arm(wishes.arm, wishes.mount, mount_pose)
     reach = ReachSearch(arm, base, found, decompose(found.obj))
-    reached = reach.all(wishes.best)
+    reached = reach.search_all(wishes.best)
     why = ", ".join(f"{count} {reason}" for reason, count in reached.refused.most_common(3))
     if not reached.rows:
         raise InputError(
@@ -103,7 +107,7 @@ def _plan_for_arm(
     }
     if reached.refused:
         written.notes.append(f"the arm can execute {len(reached.rows)} of {reached.candidates} grasps; left out: {why}")
-    of_arm = hand_limits(arm.model)
+    of_arm = velocity_limits(arm.model)
     written.notes += _assumptions(of_arm)
     names = (*arm.model.joint_names, *found.hand.joint_names)
     velocity = np.concatenate([of_arm.velocity, limits.velocity])
@@ -113,7 +117,7 @@ def _plan_for_arm(
 
 
 def _plan_executions(
-    source: Path, shard: Shard, description: Description, wishes: RobotExportOptions, written: ExportSummary
+    source: Path, shard: Shard, description: HandDescription, wishes: RobotExportOptions, written: ExportSummary
 ) -> Executions:
     case = load_case(source, hand=wishes.hand, obj=wishes.obj)
     mask, word = select_grasps(shard, unvalidated=wishes.unvalidated, every=wishes.every)
@@ -124,7 +128,7 @@ def _plan_executions(
     success = np.asarray(shard.arrays.get("quality/success", np.full(len(valid), -1)))
     epsilon = metric_at_threshold(shard.arrays, "quality/epsilon")
     quality: dict[str, NDArray[Any]] = {"valid": valid[rows], "success": success[rows], "epsilon": epsilon[rows]}
-    found = executions(case.hand, case.obj, grasps, rows=rows, tool=tool, quality=quality, placed=placed)
+    found = build_executions(case.hand, case.obj, grasps, rows=rows, tool=tool, quality=quality, placed=placed)
     if lost := len(rows) - len(found):
         written.notes.append(
             f"{lost} of {len(rows)} {word} are left out: no straight approach of 10 cm is free of the object"
@@ -132,7 +136,7 @@ def _plan_executions(
     return found
 
 
-def _assumptions(limits: Limits) -> list[str]:
+def _assumptions(limits: VelocityLimits) -> list[str]:
     if not limits.assumed:
         return []
     names = ", ".join(limits.assumed[:3]) + (", ..." if len(limits.assumed) > 3 else "")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from graspd.exchange.imported import ImportedGrasps, Origin, mesh_file
+from graspd.exchange.imported import ImportedGrasps, Origin, write_mesh
 from graspd.exchange.plan import plain_name
 from graspd.service.model.digests import digest_files, digest_json
 from graspd.service.model.domain import JobRequest
@@ -44,11 +44,11 @@ def write_scored(
         request = JobRequest.model_validate(pair | wanted | {"validation": validation, "friction": friction})
     except ValueError:
         raise InputError(f"unknown level {validation!r}; choose dexgraspbench, standard, fast or none") from None
-    scenes = None if found.placed is None else found.placed.everywhere
+    scenes = None if found.placed is None else found.placed.all_scenes
     obj = apply_request(found.obj, request)
     made = score_grasps(found.hand, obj, found.grasps, request, scenes=scenes, run=run)
     folder.mkdir(parents=True, exist_ok=True)
-    mesh = mesh_file(found.obj, folder / f"{name}-{found.scale:g}.obj")
+    mesh = write_mesh(found.obj, folder / f"{name}-{found.scale:g}.obj")
     digest = digest_files(AssetKind.OBJECT, files_from_path(mesh)[1])
     attributes: dict[str, Attribute] = {
         "hand": found.hand.name,

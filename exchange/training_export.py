@@ -18,7 +18,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 from graspd.service.readers import Pictures, Shards, open_shards
 from graspd.service.readers.clouds import COLUMNS
-from graspd.service.readers.depth_noise import noise_of
+from graspd.service.readers.depth_noise import parse_depth_noise
 from graspd.service.store import validity
 from graspd.service.store.shards import Shard, read_shard
 from graspd.worker.files.subsets import select_grasps
@@ -54,14 +54,14 @@ def export_training(source: Path, format_: str, wishes: TrainingExportOptions, f
     if format_ == "lerobot":
         return lerobot.write(lots, pictures, folder, out)
     writer = {"dexlearn": dexlearn.write, "dexgraspnet2": dexgraspnet2.write, "huggingface": huggingface.write}[format_]
-    return writer(lots, pictures, folder, out, noise_of(wishes.noise or None))
+    return writer(lots, pictures, folder, out, parse_depth_noise(wishes.noise or None))
 
 
 def _export_parts(shards: Shards, format_: str, wishes: TrainingExportOptions) -> list[ExportPart]:
     lots: list[ExportPart] = []
     digests: dict[str, str] = {}
     refused: InputError | None = None
-    for file in shards.of("base"):
+    for file in shards.of_kind("base"):
         path = shards.path(file)
         shard = read_shard(path, kind="base")
         try:

@@ -41,7 +41,7 @@ def write(
         path = folder / f"pictures-{first // pictures_a_file:06}.tar"
         with tarfile.open(path, "w") as tar:
             for index in range(first, min(first + pictures_a_file, len(pictures))):
-                for name, data in _members(shards, pictures[index]):
+                for name, data in _sample_files(shards, pictures[index]):
                     entry = tarfile.TarInfo(f"{index:08}.{name}")
                     entry.size = len(data)
                     tar.addfile(entry, io.BytesIO(data))
@@ -49,7 +49,7 @@ def write(
     return written
 
 
-def _members(shards: Shards, sample: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
+def _sample_files(shards: Shards, sample: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
     with tempfile.TemporaryDirectory() as scratch:
         png, exr = Path(scratch) / "file.png", Path(scratch) / "file.exr"
         yield "rgb.png", export_png(png, sample["image/rgb"]).read_bytes()

@@ -18,7 +18,7 @@ from typer.core import TyperCommand, TyperGroup
 from graspd.service.cli import run_command_line
 from graspd.service.model.base import problem_text
 from graspd.service.model.errors import did_you_mean
-from graspd.service.model.libraries import mark_process, pause_garbage_collection
+from graspd.service.model.libraries import freeze_imports, pause_garbage_collection
 from graspd.service.model.version import PACKAGE_VERSION
 
 #: Name, module, panel of the overview, and help of each command.
@@ -109,11 +109,11 @@ class LazyGroup(TyperGroup):
         # Without the API, as in a worker's image, `hands check` and `objects check` still work.
         package = next((package for parent, child, package, _ in JOINED if [parent, child] == [name, *rest[:1]]), None)
         if package and missing_extra(module):
-            return f"{name} {rest[0]}", load(package, rest[0], ctx), rest[1:]
-        return name, load(module, name, ctx), rest
+            return f"{name} {rest[0]}", load_command(package, rest[0], ctx), rest[1:]
+        return name, load_command(module, name, ctx), rest
 
 
-class Deferred(TyperCommand):
+class DeferredCommand(TyperCommand):
     """Placeholder in a group for a command of another package; a call imports that package."""
 
     def __init__(self, name: str, module: str, help: str) -> None:
@@ -123,10 +123,10 @@ class Deferred(TyperCommand):
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
         if extra.get("resilient_parsing") and missing_extra(self.module):
             return super().make_context(info_name, args, parent, **extra)
-        return load(self.module, str(self.name), parent).make_context(info_name, args, parent, **extra)
+        return load_command(self.module, str(self.name), parent).make_context(info_name, args, parent, **extra)
 
 
-def load(module: str, name: str, ctx: Any = None) -> Any:
+def load_command(module: str, name: str, ctx: Any = None) -> Any:
     """Import a command; print one line and exit with code 1 if its package is not installed."""
     if missing := missing_extra(module):
         path = f"{ctx.command_path} {name}" if ctx else f"graspd {name}"
@@ -139,7 +139,7 @@ def load(module: str, name: str, ctx: Any = None) -> Any:
     if isinstance(command, TyperGroup):
         for parent, child, package, text in JOINED:
             if parent == name:
-                command.add_command(Deferred(child, package, text))
+                command.add_command(DeferredCommand(child, package, text))
     # typer adds completion options to a single command; they would install completion for `graspd` itself.
     command.params = [one for one in command.params if not str(one.name).endswith("_completion")]
     escape_help(command)
@@ -203,7 +203,7 @@ def _entry() -> None:
 
 
 def main() -> None:
-    mark_process()
+    freeze_imports()
     # Commands do not draw with MuJoCo. Without this setting, its import would start a process to search for GLFW.
     os.environ.setdefault("MUJOCO_GL", "disable")
     # Without this setting, pydantic searches all installed packages for plugins; an empty variable enables them.

@@ -15,7 +15,7 @@ from graspd.api.models import JobDetail
 from graspd.client.client import Client
 from graspd.client.reports import JobDisplay, job_summary, mean_metrics, yield_of
 from graspd.service.cli import CommandGroup, JsonFlag, load_settings, plain_console, print_json, write_output
-from graspd.service.command_options import parsed_options
+from graspd.service.command_options import validate_options
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import TaskError
 from graspd.service.model.states import AssetKind, State
@@ -44,7 +44,7 @@ def demo(
 ) -> None:
     """Make grasps, scenes and pictures of built-in data, and a results page."""
     asked: dict[str, Any] = {"hand": hand, "object": object, "grasps": grasps, "fidelity": fidelity, "seed": seed}
-    request = parsed_options(JobRequest, asked | {"scenes": scenes, "views": views, "stereo": views > 0})
+    request = validate_options(JobRequest, asked | {"scenes": scenes, "views": views, "stereo": views > 0})
     console = plain_console(stderr=json)
     out.mkdir(parents=True, exist_ok=True)
     settings = load_settings(data_dir=out / "service", host="127.0.0.1", port=0)
@@ -53,7 +53,7 @@ def demo(
             service.wait_ready(say=lambda line: console.print(line, soft_wrap=True))
         console.print(f"the service runs at {service.api_url} until the job is done")
         with Client(service.api_url) as client:
-            job, files = run(client, request, out, console)
+            job, files = run_job(client, request, out, console)
     results = write_pages(out, job, files)
     if json:
         print_json(job_summary(job) | results)
@@ -61,7 +61,7 @@ def demo(
         print_results(console, job, results)
 
 
-def run(client: Client, request: JobRequest, out: Path, console: Console) -> tuple[JobDetail, list[Path]]:
+def run_job(client: Client, request: JobRequest, out: Path, console: Console) -> tuple[JobDetail, list[Path]]:
     """Submit the job, watch it, and fetch its files; return the job and its shards."""
     job = client.submit(request)
     console.print(f"job {job.id[:12]}: {request.grasps} grasps of {request.hand} on {request.object}")
@@ -117,7 +117,7 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
 
     backend.start_warp()
     hand = load_hand(builtin_files(AssetKind.HAND, job.hand), name=job.hand, digest=job.hand_digest)
-    files, error_m = builtin_files(AssetKind.OBJECT, job.object), job.request.knobs.face_error_m
+    files, error_m = builtin_files(AssetKind.OBJECT, job.object), job.request.resolved_fidelity.face_error_m
     obj = load_object(files, name=job.object, digest=job.object_digest, face_error_m=error_m)
     rows = best_rows(base.arrays, _SHOWN_GRASPS, validity.valid_mask(base.arrays))
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))

@@ -32,7 +32,7 @@ _MORE: Final = {
 }
 
 
-def frame_of(grasps: Grasps) -> Any:
+def data_frame_of(grasps: Grasps) -> Any:
     try:
         import pandas
     except ModuleNotFoundError:
@@ -40,30 +40,30 @@ def frame_of(grasps: Grasps) -> Any:
     columns = grasps.columns
     found: dict[str, Any] = {"object": columns["object"], "valid": grasps.is_valid}
 
-    def add(before: str, pose: str, joints: str) -> None:
+    def add_columns(before: str, pose: str, joints: str) -> None:
         if pose in columns:
             found.update({before + part: columns[pose][:, k] for k, part in enumerate(POSE_PARTS)})
         for k, joint in enumerate(grasps.joint_names if joints in columns else ()):
             # A joint of a gantry may be named x, like a column of the pose.
             found[before + (joint if before + joint not in found else f"joint.{joint}")] = columns[joints][:, k]
 
-    add("", "grasp/hand_pose", "grasp/joint_positions")
+    add_columns("", "grasp/hand_pose", "grasp/joint_positions")
     found |= {name: grasps.metric(name) for name in grasps.metrics}
     for path, data in columns.items():
         name = path.rpartition("/")[2]
         if path.startswith(("grasp/", "quality/")) and data.shape == (len(grasps),) and name not in found:
             found[name] = data
     for before, paths in _MORE.items():
-        add(before, *paths)
+        add_columns(before, *paths)
     return pandas.DataFrame(found)
 
 
-def html_of(grasps: Grasps) -> str:
+def grasps_html(grasps: Grasps) -> str:
     """Return `repr` and a picture of the best grasps as HTML.
     A table of their metrics replaces a picture that is missing or too large."""
     head = f"<p>{escape(repr(grasps))}</p>"
     try:
-        png = sheet_of(grasps, PICTURED, EDGE, PICTURE_S)
+        png = sheet_png(grasps, PICTURED, EDGE, PICTURE_S)
     # A notebook must display its grasps even if a file, engine or driver is missing.
     except Exception:
         png = b""
@@ -73,7 +73,7 @@ def html_of(grasps: Grasps) -> str:
     return f'{head}<img alt="the best grasps" style="max-width:100%" src="data:image/png;base64,{data}">'
 
 
-def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
+def start_viewer(grasps: Grasps, *, host: str, port: int) -> Viewer:
     try:
         from graspd.worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
         from graspd.worker.viewing import Viewer, ViewerContent, missing_viewer_text
@@ -86,7 +86,7 @@ def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
     return Viewer(ViewerContent(shard, hand, obj, neighbours_of_shard(shard, [])), host=host, port=port)
 
 
-def sheet_of(grasps: Grasps, count: int, edge: int, limit_s: float = math.inf) -> bytes:
+def sheet_png(grasps: Grasps, count: int, edge: int, limit_s: float = math.inf) -> bytes:
     """Return a PNG of the best grasps, `edge` pixels each; raise TaskCancelled after `limit_s`."""
     from graspd.commands.grasp_sheet import GraspSheet
     from graspd.worker.engines.devices import Device
@@ -94,7 +94,7 @@ def sheet_of(grasps: Grasps, count: int, edge: int, limit_s: float = math.inf) -
     from graspd.worker.files.provenance import hand_of_shard, object_of_shard
 
     shard, until = grasps.shard(), time.monotonic() + limit_s
-    rows = _best(grasps, count)
+    rows = _best_rows(grasps, count)
     if not len(rows):
         raise InputError("there is no grasp to draw")
     hand, obj = hand_of_shard(shard, None), object_of_shard(shard, None)
@@ -103,7 +103,7 @@ def sheet_of(grasps: Grasps, count: int, edge: int, limit_s: float = math.inf) -
 
 
 def _table(grasps: Grasps) -> str:
-    rows = _best(grasps, PICTURED)
+    rows = _best_rows(grasps, PICTURED)
     names = [name for name in _FIGURES if name in grasps.metrics]
     head = "".join(f"<th>{escape(name)}</th>" for name in ("row", "valid", *names))
     values = {name: grasps.metric(name) for name in names}
@@ -116,7 +116,7 @@ def _table(grasps: Grasps) -> str:
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def _best(grasps: Grasps, count: int) -> np.ndarray:
+def _best_rows(grasps: Grasps, count: int) -> np.ndarray:
     """Return rows of the best `count` grasps by epsilon, valid ones first."""
     epsilon = np.nan_to_num(np.asarray(grasps.metric("epsilon"), float), nan=-1.0)
     return np.lexsort((-epsilon, ~grasps.is_valid))[:count]

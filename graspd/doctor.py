@@ -66,19 +66,19 @@ def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
     """Return the checks of all packages; a check of a missing package reports that it is not installed."""
     checks = checks_of(settings, full=full)
     if missing_extra("graspd.api"):
-        checks.append(_missing_extra("keys", "api"))
+        checks.append(_skipped_check("keys", "api"))
     else:
         from graspd.api.access.doctor import check_keys
 
         checks.append(Check("keys", partial(check_keys, settings)))
     if missing_extra("graspd.commands"):
-        return [*checks, _missing_extra("gpu", "worker"), _missing_extra("kernels", "worker")]
+        return [*checks, _skipped_check("gpu", "worker"), _skipped_check("kernels", "worker")]
     from graspd.commands.doctor import checks_of as of_worker
 
     return checks + of_worker(settings)
 
 
-def _missing_extra(name: str, extra: str) -> Check:
+def _skipped_check(name: str, extra: str) -> Check:
     return Check(name, lambda: skipped(f"graspd[{extra}] is not part of this install"))
 
 

@@ -95,9 +95,9 @@ class Grasps:
         return f"<{len(self)} grasps of {self.hand} on {names or 'nothing'}, {int(self.is_valid.sum())} valid>"
 
     def _repr_html_(self) -> str:
-        from graspd.display import html_of
+        from graspd.display import grasps_html
 
-        return html_of(self)
+        return grasps_html(self)
 
     def __iter__(self) -> Iterator[Grasp]:
         return (self[i] for i in range(len(self)))
@@ -111,7 +111,7 @@ class Grasps:
         if isinstance(rows, int | np.integer):
             if not -len(self) <= rows < len(self):
                 raise IndexError(f"there is no grasp {rows}; of {len(self)} the last is {len(self) - 1}")
-            return self._one(int(rows) % len(self))
+            return self._grasp_at(int(rows) % len(self))
         chosen = rows if isinstance(rows, slice) else np.asarray(rows)
         if isinstance(chosen, np.ndarray) and not len(chosen):
             chosen = chosen.astype(int)
@@ -214,7 +214,7 @@ class Grasps:
         Raises:
             InputError: the file has no such metric.
         """
-        known = self._metric(name)
+        known = self._find_metric(name)
         values = self._columns[known.path]
         if not known.swept:
             return values
@@ -255,7 +255,7 @@ class Grasps:
         if count < 0:
             raise InputError(f"top {metric} of {count}: the number of grasps must be at least 0")
         values = np.asarray(self.metric(metric), float)
-        order = np.argsort(values if self._metric(metric).less_is_better else -values, kind="stable")
+        order = np.argsort(values if self._find_metric(metric).less_is_better else -values, kind="stable")
         return self[order[np.isfinite(values[order])][:count]]
 
     def to_pandas(self) -> Any:
@@ -269,9 +269,9 @@ class Grasps:
         Raises:
             InputError: pandas is not installed.
         """
-        from graspd.display import frame_of
+        from graspd.display import data_frame_of
 
-        return frame_of(self)
+        return data_frame_of(self)
 
     def plot(self, count: int = 4, *, edge: int = 320) -> Image:
         """Draw the best grasps by epsilon on one sheet, valid ones first, each in a square of `edge` pixels.
@@ -282,9 +282,9 @@ class Grasps:
         """
         import PIL.Image
 
-        from graspd.display import sheet_of
+        from graspd.display import sheet_png
 
-        return PIL.Image.open(io.BytesIO(sheet_of(self, count, edge)))
+        return PIL.Image.open(io.BytesIO(sheet_png(self, count, edge)))
 
     def view(self, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
         """Serve the grasps in 3D to a browser until `close()` of the result; `url` is its address.
@@ -298,9 +298,9 @@ class Grasps:
                 the address cannot be used.
             NotFoundError: the file of the hand or the object is not found.
         """
-        from graspd.display import viewer_of
+        from graspd.display import start_viewer
 
-        return viewer_of(self, host=host, port=port)
+        return start_viewer(self, host=host, port=port)
 
     def shard(self) -> Shard:
         """Return the grasps as a base shard, with the content that `save` writes.
@@ -331,13 +331,13 @@ class Grasps:
             raise InputError(f"{path} cannot be written: {error.strerror}") from None
         return Path(path)
 
-    def _metric(self, name: str) -> GraspMetric:
+    def _find_metric(self, name: str) -> GraspMetric:
         metric = _METRICS.get(name)
         if metric is None or metric.path not in self._columns:
             raise InputError(f"these grasps have no metric {name!r}; they have {', '.join(self.metrics)}")
         return metric
 
-    def _one(self, row: int) -> Grasp:
+    def _grasp_at(self, row: int) -> Grasp:
         joints = dict(zip(self.joint_names, map(float, self.joint_positions[row]), strict=True))
         metrics = {name: float(self.metric(name)[row]) for name in self.metrics}
         return Grasp(self.hand_pose[row], joints, bool(self.is_valid[row]), metrics)
@@ -364,7 +364,9 @@ def open(
         DamagedError: a file does not match its checksum.
     """
     shards = open_shards(source, job=job, dataset=dataset)
-    return concatenate([read_shard(shards.path(file), kind="base") for file in _of_hand(shards, hand).of("base")])
+    return concatenate(
+        [read_shard(shards.path(file), kind="base") for file in _select_hand(shards, hand).of_kind("base")]
+    )
 
 
 def concatenate(shards: Sequence[Shard]) -> Grasps:
@@ -393,10 +395,10 @@ def concatenate(shards: Sequence[Shard]) -> Grasps:
     return Grasps(columns, first.attributes, first.path)
 
 
-def _of_hand(shards: Shards, hand: str | None) -> Shards:
-    hands = sorted({file.hand for file in shards.of("base")})
+def _select_hand(shards: Shards, hand: str | None) -> Shards:
+    hands = sorted({file.hand for file in shards.of_kind("base")})
     if hand is not None and hand not in hands:
         raise InputError(f"there are no grasps of the hand {hand!r}; hands with grasps: {', '.join(hands) or 'none'}")
     if hand is None and len(hands) > 1:
         raise InputError(f"these are grasps of {', '.join(hands)}; name one of them: hand={hands[0]!r}")
-    return shards.only(hands=[hand]) if hand else shards
+    return shards.select(hands=[hand]) if hand else shards

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 try:
     from graspd.api.models import JobDetail
     from graspd.client.client import Client as HttpClient
-    from graspd.client.client import path_of
+    from graspd.client.client import request_path
     from graspd.client.reports import open_client
 except ModuleNotFoundError as error:
     raise ImportError(f"graspd.Client needs {error.name}; run pip install 'graspd[api]'") from error
@@ -79,7 +79,7 @@ class Client:
         Raises:
             NotFoundError: there is no such shard.
         """
-        file = b"".join(self._http.fetch(path_of("shards", shard_id, "file")))
+        file = b"".join(self._http.fetch(request_path("shards", shard_id, "file")))
         return concatenate([read_shard(file, kind="base", name=shard_id[:12])])
 
 

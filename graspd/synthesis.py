@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Final, Unpack
 from graspd.grasps import Grasps
 from graspd.service.model.errors import InputError
 from graspd.service.model.local_options import LocalOptions
-from graspd.service.model.options import rows, validate, with_keywords
+from graspd.service.model.options import option_rows, validate, with_keywords
 
 if TYPE_CHECKING:
     from graspd.keywords import SynthesizeKeywords
 
-_KEYWORDS: Final = {flag: row.name for row in rows(LocalOptions, "python") for flag in row.flags}
+_KEYWORDS: Final = {flag: row.name for row in option_rows(LocalOptions, "python") for flag in row.flags}
 _FLAG: Final = re.compile(r"--[a-z]+(?:-[a-z]+)*")
 
 
@@ -51,14 +51,14 @@ def synthesize(
     except TypeError as error:
         raise TypeError(f"synthesize() {error}") from None
     try:
-        from graspd.worker.files.synthesis import synthesize_with
+        from graspd.worker.files.synthesis import synthesize_with_options
     except ModuleNotFoundError as error:
         raise ImportError(f"synthesize needs {error.name}; run pip install 'graspd[worker]'") from error
     # None means that the option was not given.
     asked = validate(LocalOptions, {name: value for name, value in options.items() if value is not None})
     on_progress = (lambda done, total, _message: progress(done / total)) if progress else None
     try:
-        made = synthesize_with(str(hand), str(object), asked, progress=on_progress)
+        made = synthesize_with_options(str(hand), str(object), asked, progress=on_progress)
     except InputError as error:
         # The engine's messages spell options as on the command line.
         error.args = (_FLAG.sub(lambda flag: _KEYWORDS.get(flag[0], flag[0]), str(error)),)

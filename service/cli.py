@@ -35,7 +35,7 @@ DataDir = Annotated[Path | None, typer.Option("--data-dir", help="Data folder of
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON object on the last line.")]
 
 
-def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
+def report_errors(command: Callable[P, R]) -> Callable[P, R]:
     """Decorate a command: errors become a line on stderr and exit code 2 (input), 130 (Ctrl-C) or 1."""
 
     @functools.wraps(command)
@@ -58,7 +58,7 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
 class CommandGroup(typer.Typer):
     def command(self, *names: Any, **options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:  # type: ignore[override]
         add = super().command(*names, **options)
-        return lambda command: add(reporting_errors(command))
+        return lambda command: add(report_errors(command))
 
 
 def run_command_line(command: Callable[[], object]) -> None:
@@ -84,11 +84,11 @@ def run_command_line(command: Callable[[], object]) -> None:
     except (OSError, MemoryError) as error:
         _discard_output(sys.stdout)
         with contextlib.suppress(OSError, typer.Exit):
-            fail(_refusal(error), 1)
+            fail(_system_error_text(error), 1)
         sys.exit(1)
 
 
-def _refusal(error: OSError | MemoryError) -> str:
+def _system_error_text(error: OSError | MemoryError) -> str:
     if isinstance(error, MemoryError):
         return "there is not enough memory; provide more, or request less at once"
     paths = ", ".join(str(name) for name in (error.filename, error.filename2) if name is not None)

@@ -13,7 +13,7 @@ import typer
 from pydantic import BaseModel
 
 from graspd.service.model.errors import InputError
-from graspd.service.model.options import EVERYWHERE, ModelT, Place, Row, rows, validate
+from graspd.service.model.options import EVERYWHERE, ModelT, OptionRow, Place, option_rows, validate
 
 
 def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -25,10 +25,10 @@ def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[...
             options = {row.name: given.pop(row.name) for row in added}
             command(**given, options={name: value for name, value in options.items() if value is not None})
 
-        added = rows(model, place)
+        added = option_rows(model, place)
         own = list(inspect.signature(command, eval_str=True).parameters.values())
         at = [parameter.name for parameter in own].index("options")
-        parameters = [*own[:at], *map(_parameter, added), *own[at + 1 :]]
+        parameters = [*own[:at], *map(_option_parameter, added), *own[at + 1 :]]
         parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
         del wrapper.__wrapped__  # The signature of the original command differs.
         wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -38,7 +38,7 @@ def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[...
     return decorate
 
 
-def _parameter(row: Row) -> inspect.Parameter:
+def _option_parameter(row: OptionRow) -> inspect.Parameter:
     text = row.meaning[:1].upper() + row.meaning[1:]
     if row.kind == list[str]:
         text += "; repeatable"
@@ -50,9 +50,9 @@ def _parameter(row: Row) -> inspect.Parameter:
     return inspect.Parameter(row.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
 
 
-def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
+def validate_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
     """Validate the given options; InputError names the first invalid one as on the command line."""
-    options = {row.name: row.flags[0].partition("/")[0] for place in EVERYWHERE for row in rows(model, place)}
+    options = {row.name: row.flags[0].partition("/")[0] for place in EVERYWHERE for row in option_rows(model, place)}
     names = {name: f"--{name.replace('_', '-')}" for name in model.model_fields}
     # The name of a dataset is an argument, not an option.
     return validate(model, values, names={**names, "name": "NAME", **options})
@@ -64,10 +64,10 @@ def parse_pairs(texts: Iterable[str]) -> dict[str, str | int | float]:
     for name, equals, value in split:
         if not equals:
             raise InputError(f"--option {name + value!r}: write it as name=value, for example steps=20000")
-    return {name: _number(value) for name, _, value in split}
+    return {name: _parse_number(value) for name, _, value in split}
 
 
-def _number(text: str) -> str | int | float:
+def _parse_number(text: str) -> str | int | float:
     for kind in (int, float):
         with suppress(ValueError):
             number = kind(text)

@@ -11,7 +11,7 @@ from typing import Final
 
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.local_options import LocalOptions
-from graspd.service.model.options import Row, keywords_of, rows
+from graspd.service.model.options import OptionRow, keywords_of, option_rows
 from graspd.service.model.series import SERIES
 from graspd.service.settings import Settings
 from graspd.service.store.columns import ATTRIBUTES, SCHEMAS, Column, ShardKind
@@ -53,7 +53,7 @@ def series_table() -> str:
 
 
 def options_table() -> str:
-    job, local = rows(JobOptions, "job"), rows(LocalOptions, "synth")
+    job, local = option_rows(JobOptions, "job"), option_rows(LocalOptions, "synth")
     same = {row.name for row in local if any(_cells(row) == _cells(other) for other in job)}
     found = [(row, "both" if row.name in same else "job") for row in job]
     found += [(row, "here") for row in local if row.name not in same]
@@ -67,7 +67,7 @@ def options_table() -> str:
     return "\n\n".join(f"## {group.capitalize()}\n\n{_table(headings, cells)}" for group, cells in tables.items())
 
 
-def _cells(row: Row) -> tuple[str, str, str]:
+def _cells(row: OptionRow) -> tuple[str, str, str]:
     default = "" if row.default is False or row.default in (None, (), {}, "") else f"`{row.default}`"
     return default, row.range, row.meaning
 

@@ -15,7 +15,7 @@ LARGEST: Final = 2**31
 IMAGE: Final = "image"
 
 
-def arrow() -> Any:
+def import_pyarrow() -> Any:
     try:
         import pyarrow
         import pyarrow.parquet
@@ -24,28 +24,28 @@ def arrow() -> Any:
     return pyarrow
 
 
-def type_of(name: str) -> Any:
+def arrow_type(name: str) -> Any:
     """Return an Arrow type by name: `image`, `text`, `int64`, ..., with suffix [LENGTH] or [] for lists."""
-    pa = arrow()
+    pa = import_pyarrow()
     if name.endswith("]"):
         inner, _, size = name[:-1].rpartition("[")
-        return pa.list_(type_of(inner), int(size)) if size else pa.list_(type_of(inner))
+        return pa.list_(arrow_type(inner), int(size)) if size else pa.list_(arrow_type(inner))
     if name == IMAGE:
         return pa.struct([("bytes", pa.binary()), ("path", pa.string())])
     return pa.string() if name == "text" else getattr(pa, name)()
 
 
-def schema_of(columns: Mapping[str, str], also: Mapping[str, str] | None = None) -> Any:
-    """Return the schema of columns with the type names of `type_of`, and metadata for Hugging Face."""
-    pa = arrow()
+def arrow_schema(columns: Mapping[str, str], also: Mapping[str, str] | None = None) -> Any:
+    """Return the schema of columns with the type names of `arrow_type`, and metadata for Hugging Face."""
+    pa = import_pyarrow()
     pictures = {name: {"_type": "Image"} for name, word in columns.items() if word == IMAGE}
     metadata = {"huggingface": json.dumps({"info": {"features": pictures}})} if pictures else {}
-    return pa.schema([(name, type_of(word)) for name, word in columns.items()], metadata=metadata | dict(also or {}))
+    return pa.schema([(name, arrow_type(word)) for name, word in columns.items()], metadata=metadata | dict(also or {}))
 
 
 def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]) -> int:
     """Write each group of rows as one row group; return the number of rows."""
-    pa = arrow()
+    pa = import_pyarrow()
     file.parent.mkdir(parents=True, exist_ok=True)
     count = 0
     with pa.parquet.ParquetWriter(file, schema, compression="zstd") as out:
@@ -57,7 +57,7 @@ def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]
 
 def read(file: Path, wanted: Iterable[str]) -> dict[str, list[Any]]:
     """Read those wanted columns that a file has; InputError for no Parquet file or more than `LARGEST`."""
-    pa = arrow()
+    pa = import_pyarrow()
     try:
         with pa.parquet.ParquetFile(file) as found:
             names = [name for name in wanted if name in found.schema_arrow.names]

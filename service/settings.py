@@ -127,7 +127,7 @@ class Settings(BaseSettings):
 
     @field_validator("api_root_path")
     @classmethod
-    def _is_path(cls, value: str | None) -> str | None:
+    def _normalize_root_path(cls, value: str | None) -> str | None:
         if value is None:
             return None
         found = f"/{value.strip('/')}".rstrip("/")

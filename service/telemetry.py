@@ -45,14 +45,14 @@ def set_up_logs(settings: Settings, process: str = "graspd") -> None:
     """Write the log of this process to stderr; `process` is its name in JSON lines."""
     is_text = settings.log_format == "text" or (settings.log_format == "auto" and sys.stderr.isatty())
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_TextLines() if is_text else JsonLines(process))
+    handler.setFormatter(_TextFormatter() if is_text else JsonFormatter(process))
     logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)
     logging.captureWarnings(True)
     for name in _TALKATIVE:
         logging.getLogger(name).setLevel(logging.WARNING)
 
 
-class JsonLines(logging.Formatter):
+class JsonFormatter(logging.Formatter):
     """One JSON object per line: time, level, process, pid, logger, message, subjects, fields of `extra`."""
 
     def __init__(self, process: str) -> None:
@@ -61,7 +61,7 @@ class JsonLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         line: dict[str, Any] = {
-            "time": _time(record),
+            "time": _format_time(record),
             "level": record.levelname,
             "process": self._process,
             "pid": os.getpid(),
@@ -75,12 +75,12 @@ class JsonLines(logging.Formatter):
         return without_secrets(json.dumps(line, default=str, ensure_ascii=False))
 
 
-class _TextLines(logging.Formatter):
+class _TextFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         about = " ".join(f"{name}={value}" for name, value in _subjects(record).items())
         trace = f"\n{self.formatException(record.exc_info)}" if record.exc_info else ""
         message = record.getMessage().translate(_OBEYED)
-        text = f"{_time(record)[11:23]} {record.levelname} {record.name} {message}"
+        text = f"{_format_time(record)[11:23]} {record.levelname} {record.name} {message}"
         return without_secrets(f"{text} [{about}]{trace}" if about else f"{text}{trace}")
 
 
@@ -97,7 +97,7 @@ def _subjects(record: logging.LogRecord) -> dict[str, Any]:
     return {name: found[name] for name in SUBJECTS if found.get(name)}
 
 
-def _time(record: logging.LogRecord) -> str:
+def _format_time(record: logging.LogRecord) -> str:
     when = datetime.fromtimestamp(record.created, UTC)
     return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 

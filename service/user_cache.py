@@ -25,7 +25,7 @@ _LIMIT_BYTES: Final = 2 << 30
 
 def cache_folder(name: str) -> Path:
     """Return the folder of one kind of entries, in `$XDG_CACHE_HOME/graspd`, else a private temporary one."""
-    return _root(os.environ.get("XDG_CACHE_HOME", ""), os.environ.get("HOME", ""), tempfile.gettempdir()) / name
+    return _cache_root(os.environ.get("XDG_CACHE_HOME", ""), os.environ.get("HOME", ""), tempfile.gettempdir()) / name
 
 
 def load(file: Path) -> bytes | None:
@@ -77,7 +77,7 @@ def evict(folder: Path, suffix: str, limit_bytes: int, *, keep: Path) -> None:
 
 
 @lru_cache(maxsize=8)
-def _root(xdg: str, home: str, temporary: str) -> Path:
+def _cache_root(xdg: str, home: str, temporary: str) -> Path:
     """Return the root of all caches; the cache of results logs a problem only once."""
     try:
         # By specification, a relative $XDG_CACHE_HOME counts as unset.
@@ -89,12 +89,12 @@ def _root(xdg: str, home: str, temporary: str) -> Path:
         problem = f"{root} cannot be written"
     except (OSError, RuntimeError) as error:
         problem = str(error)
-    root = _private(Path(temporary))
+    root = _private_folder(Path(temporary))
     log.warning("no cache in the home folder (%s); reproducible files are in %s", problem, root)
     return root
 
 
-def _private(temporary: Path) -> Path:
+def _private_folder(temporary: Path) -> Path:
     """Create a private folder; return `/dev/null` if another user owns the path."""
     mine = temporary / f"graspd-cache-{os.geteuid()}"
     with suppress(OSError):

@@ -59,7 +59,7 @@ def bench(
     for fidelity in fidelities:
         obj = load(fidelity.face_error_m)
         for batch, join, count in product(batches, joins, threads):
-            run = _run(hand, obj, fidelity, batch, join, ExecutionContext(device, count), repeats)
+            run = _time_combination(hand, obj, fidelity, batch, join, ExecutionContext(device, count), repeats)
             runs.append(run)
             say(
                 f"{fidelity.name:9s} batch {batch:5d} x {join} threads {count}: {run['grasps_per_second']:8.1f} "
@@ -67,7 +67,7 @@ def bench(
             )
     host = None
     if not wp.get_device(device).is_cuda:
-        host = round(host_ms(hand, nominal, first, min(LARGE, max(batches) * max(joins))), 3)
+        host = round(measure_host_ms(hand, nominal, first, min(LARGE, max(batches) * max(joins))), 3)
     return {
         "device": device_name(device),
         "hand": hand.name,
@@ -90,7 +90,7 @@ def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: 
     return {"first_grasp_s": seconds[0], "next_grasp_s": seconds[1]}
 
 
-def _run(
+def _time_combination(
     hand: HandModel, obj: ObjectModel, fidelity: Fidelity, batch: int, join: int, run: ExecutionContext, repeats: int
 ) -> dict[str, Any]:
     seconds = []
@@ -142,7 +142,7 @@ def kernel_shares(pair: Pair, fidelity: Fidelity, count: int) -> dict[str, Any]:
         model = pair.model(side)
         data = Data(model, count)
         used = _iterations_used(model, data, state, schedule, fidelity, name)
-        times, state = _timed(model, data, state, schedule, fidelity)
+        times, state = _time_kernels(model, data, state, schedule, fidelity)
         total = sum(times.values())
         phases[name] = {
             "iterations_to_convergence": round(used, 1),
@@ -170,7 +170,7 @@ def _iterations_used(
     return alive / len(state.pivot)
 
 
-def _timed(
+def _time_kernels(
     model: Model, data: Data, state: HandState, schedule: Schedule, fidelity: Fidelity
 ) -> tuple[dict[str, float], HandState]:
     """Return each kernel's median seconds over `SAMPLED` middle iterations, and the hands at the end."""
@@ -183,7 +183,7 @@ def _timed(
     wp.synchronize_device(data.device)
     found: dict[str, list[float]] = {}
     for _ in range(sampled):
-        for name, command in launches.named():
+        for name, command in launches.named_commands():
             began = time.perf_counter()
             command.launch()
             wp.synchronize_device(data.device)
@@ -192,7 +192,7 @@ def _timed(
     return {name: float(np.median(values)) for name, values in found.items()}, data.state(len(state.pivot))
 
 
-def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
+def measure_host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
     """Return host time per candidate [ms], with full caches.
     It is the time of one CPU thread outside the planner's kernels."""
     run = ExecutionContext("cpu", threads=1)
@@ -215,7 +215,7 @@ def clock_of(device: str) -> Callable[[], float]:
     return time.process_time if device == "cpu" else time.perf_counter
 
 
-def table(result: dict[str, Any]) -> str:
+def results_table(result: dict[str, Any]) -> str:
     """Return the result of `bench` in Markdown."""
     lines = [
         f"{result['hand']} on {result['object']}, {result['device']}, graspd {result['versions']['graspd']}, "
@@ -225,7 +225,7 @@ def table(result: dict[str, Any]) -> str:
         "| --- | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
     lines += [
-        f"| {r['fidelity']} | {_batches(r)} | {r['processes']} | {r['coarse_points']}, {r['hand_points']} "
+        f"| {r['fidelity']} | {_batch_text(r)} | {r['processes']} | {r['coarse_points']}, {r['hand_points']} "
         f"| {r['faces']} | {r['iterations']} | {r['ms_per_iteration']:.2f} | {r['grasps_per_second']:.1f} "
         f"| {100 * r['spread']:.0f} % | {r['peak_memory_mb']:.0f} |"
         for r in result["runs"]
@@ -244,14 +244,14 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _batches(run: dict[str, Any]) -> str:
+def _batch_text(run: dict[str, Any]) -> str:
     return str(run["batch"]) if run["join"] == 1 else f"{run['join']} × {run['batch']}"
 
 
 def write(result: dict[str, Any], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "bench.json").write_text(json.dumps(result, indent=1) + "\n")
-    (folder / "bench.md").write_text(table(result) + "\n")
+    (folder / "bench.md").write_text(results_table(result) + "\n")
     _plot(result, folder / "bench.png")
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from graspd.exchange.inputs import Case
 from graspd.service.model.errors import InputError, MeshError
-from graspd.service.model.metrics import axis_word
+from graspd.service.model.metrics import perturbed_parameter_name
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.hand_matching import HandMatch
@@ -125,14 +125,17 @@ def _model_results(
     tried = np.isfinite(found.share)
     for one, share, weakest in zip(row.get("verdicts", []), found.share, found.weakest, strict=True):
         known = math.isfinite(share)
-        one |= {"robust_share": _plain(share) if known else None, "robust_weakest": axis_word(int(weakest))}
+        one |= {
+            "robust_share": _rounded(share) if known else None,
+            "robust_weakest": perturbed_parameter_name(int(weakest)),
+        }
     counts = found.by_axis()
     return {
-        "robust_share": _plain(float(found.share[tried].mean())) if tried.any() else None,
+        "robust_share": _rounded(float(found.share[tried].mean())) if tried.any() else None,
         "robust_models": found.held.shape[1],
         "robust_n": int(tried.sum()),
-        "robust_seconds": _plain(found.seconds),
-        "robust_axes": {axis.word: {"share": _plain(held / n), "n": n} for axis, (held, n) in counts.items()},
+        "robust_seconds": _rounded(found.seconds),
+        "robust_axes": {axis.word: {"share": _rounded(held / n), "n": n} for axis, (held, n) in counts.items()},
     }
 
 
@@ -144,11 +147,11 @@ def _success(case: Case, verdicts: Verdicts) -> dict[str, Any]:
     whole = None if made is None else made + (0.0 if case.validated else verdicts.seconds)
     row: dict[str, Any] = {
         "level": verdicts.level,
-        "gsr": _plain(held / len(case.grasps)),
+        "gsr": _rounded(held / len(case.grasps)),
         "osr": float(held > 0),
-        "sgs": _plain(held / whole) if whole else None,
-        "sgs_without_validation": _plain(held / made) if made and not case.validated else None,
-        "validation_seconds": _plain(verdicts.seconds),
+        "sgs": _rounded(held / whole) if whole else None,
+        "sgs_without_validation": _rounded(held / made) if made and not case.validated else None,
+        "validation_seconds": _rounded(verdicts.seconds),
         "published": 0,
         "reasons": dict(Counter(verdicts.reasons).most_common()),
         "verdict_key": verdicts.terms,
@@ -157,7 +160,7 @@ def _success(case: Case, verdicts: Verdicts) -> dict[str, Any]:
     }
     if case.published is not None and (known := case.published >= 0).any():
         row["published"] = int(known.sum())
-        row["agreement_published"] = _plain(float((case.published == verdicts.success)[known].mean()))
+        row["agreement_published"] = _rounded(float((case.published == verdicts.success)[known].mean()))
     return row
 
 
@@ -174,10 +177,10 @@ def _lift_rates(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, A
     rows = _verdict_rows(verdicts, verdicts.outcome[:, None], LiftOutcome)
     return {
         "level": verdicts.level,
-        "gsr": _plain(held / max(1, count)),
+        "gsr": _rounded(held / max(1, count)),
         "osr": float(held > 0),
-        "clear_share": _plain(float(clear.mean())) if len(clear) else None,
-        "validation_seconds": _plain(verdicts.seconds),
+        "clear_share": _rounded(float(clear.mean())) if len(clear) else None,
+        "validation_seconds": _rounded(verdicts.seconds),
         "reasons": dict(Counter(verdicts.reasons).most_common()),
         "verdict_key": verdicts.terms,
         "verdicts": [row | {"clear": bool(free)} for row, free in zip(rows, clear, strict=True)],
@@ -194,7 +197,7 @@ def _verdict_rows(
             "row": row,
             "held": bool(held),
             "outcomes": [kind(int(one)).name.lower() for one in own],
-            "margin": _plain(margin) if math.isfinite(margin) else None,
+            "margin": _rounded(margin) if math.isfinite(margin) else None,
             "reason": reason,
         }
         for row, (held, own, margin, reason) in enumerate(columns)
@@ -210,24 +213,24 @@ def _medians(case: Case, table: dict[str, NDArray[Any]], sd: NDArray[np.float64]
     return row | {
         "cdc_mm": _median(cdc),
         "sd_cm": None if sd is None else _median(sd),
-        "diversity": _plain(float(shares[0])) if len(shares) else None,
-        "nearest_mm": None if apart is None else _plain(1e3 * apart),
+        "diversity": _rounded(float(shares[0])) if len(shares) else None,
+        "nearest_mm": None if apart is None else _rounded(1e3 * apart),
     }
 
 
 def _median(values: NDArray[Any]) -> float | None:
-    return _plain(float(np.median(values))) if values.size else None
+    return _rounded(float(np.median(values))) if values.size else None
 
 
-def _plain(value: float) -> float:
+def _rounded(value: float) -> float:
     return round(float(value), 6)
 
 
-#: Keys that `combine` summarises by medians over rows.
+#: Keys that `combine_rows` summarises by medians over rows.
 _MEDIANS: Final = (*COLUMNS, "cdc_mm", "sd_cm", "diversity")
 
 
-def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def combine_rows(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Combine rows of several objects: rates over all grasps, osr over objects, medians of their medians."""
     if len(rows) == 1:
         return dict(rows[0])
@@ -239,10 +242,10 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
     out["gsr"] = _rate(validated, "gsr", "n")
     if any("clear_share" in row for row in rows):
         out["clear_share"] = _rate([row for row in rows if row.get("clear_share") is not None], "clear_share", "n")
-    out["osr"] = _plain(float(np.mean([row["osr"] for row in validated]))) if validated else None
+    out["osr"] = _rounded(float(np.mean([row["osr"] for row in validated]))) if validated else None
     out["agreement_published"] = _rate(validated, "agreement_published", "published")
     if any("robust_share" in row for row in rows):
-        out |= _models([row for row in rows if "robust_share" in row])
+        out |= _combine_models([row for row in rows if "robust_share" in row])
     if counted := [row["foreign_held"] for row in rows if "foreign_held" in row]:
         out |= share_counts({key: sum(one[key] for one in counted) for key in counted[0]})
         out["fingertips_mm"] = max(row["fingertips_mm"] for row in rows if "foreign_held" in row)
@@ -250,16 +253,16 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
         # Held grasps of all rows over the seconds of all rows.
         timed = [row for row in validated if row[key]]
         seconds = sum(row["gsr"] * row["n"] / row[key] for row in timed)
-        out[key] = _plain(sum(row["gsr"] * row["n"] for row in timed) / seconds) if timed else None
+        out[key] = _rounded(sum(row["gsr"] * row["n"] for row in timed) / seconds) if timed else None
     for key in _MEDIANS:
         known = [row[key] for row in rows if row[key] is not None]
-        out[key] = _plain(float(np.median(known))) if known else None
+        out[key] = _rounded(float(np.median(known))) if known else None
     near = [row["nearest_mm"] for row in rows if row.get("nearest_mm") is not None]
     out["nearest_mm"] = min(near) if near else None
     return out
 
 
-def _models(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def _combine_models(rows: list[dict[str, Any]]) -> dict[str, Any]:
     axes: dict[str, list[tuple[float, int]]] = {}
     for row in rows:
         for axis, one in row["robust_axes"].items():
@@ -270,7 +273,7 @@ def _models(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "robust_models": rows[0]["robust_models"],
         "robust_n": sum(row["robust_n"] for row in rows),
         "robust_axes": {
-            axis: {"share": _plain(sum(share * n for share, n in parts) / total[axis]), "n": total[axis]}
+            axis: {"share": _rounded(sum(share * n for share, n in parts) / total[axis]), "n": total[axis]}
             for axis, parts in axes.items()
         },
     }
@@ -280,4 +283,4 @@ def _rate(rows: list[dict[str, Any]], key: str, weight: str) -> float | None:
     """Return the mean over rows in which `key` is known, weighted by their `weight`."""
     known = [row for row in rows if row[key] is not None]
     total = sum(row[weight] for row in known)
-    return _plain(sum(row[key] * row[weight] for row in known) / total) if total else None
+    return _rounded(sum(row[key] * row[weight] for row in known) / total) if total else None

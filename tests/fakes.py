@@ -20,12 +20,12 @@ from graspd.service.index.views import TaskView
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.messages import TaskMessage, WorkerBeat
-from graspd.service.model.planning import PlannedTask, message_of, plan_tasks
+from graspd.service.model.messages import TaskMessage, WorkerHeartbeat
+from graspd.service.model.planning import PlannedTask, create_task_message, plan_tasks
 from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.datasets.actions import DatasetRounds
+from graspd.service.pipeline.datasets.actions import DatasetController
 from graspd.service.store.integrity import put_document
 from graspd.service.store.library import publish_asset
 from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard, publish_shard
@@ -35,7 +35,7 @@ from graspd.worker.process.engine import Engine
 from graspd.worker.process.fitness import Check
 from graspd.worker.process.link import Link, Setup, StartEngine, start_engine
 from graspd.worker.process.selfcheck import EngineError
-from graspd.worker.stages.context import Output, StageFunction, TaskContext, shard_of
+from graspd.worker.stages.context import Output, StageFunction, TaskContext, build_shard
 from graspd.worker.stages.ranges import base_rows, join_outputs, split_into_batches
 
 HAND_FILES = {"asset.json": b'{"file": "hand.urdf"}', "hand.urdf": b"<robot name='fake'/>"}
@@ -103,7 +103,7 @@ def fake_stages() -> dict[Stage, Any]:
 def make_shard(store: Store, message: TaskMessage, *, worker: str = "w") -> ShardManifest:
     context = TaskContext(store)
     made = fake_stages()[message.stage](message, context)
-    manifest, data = shard_of(message, made, device="cpu", seconds=0.5, worker=worker)
+    manifest, data = build_shard(message, made, device="cpu", seconds=0.5, worker=worker)
     return manifest if publish_shard(store, manifest, data) else load_manifest(store, manifest.stage, manifest.shard_id)
 
 
@@ -131,7 +131,7 @@ def record_of(services: Services, job: str) -> JobRecord:
 
 def make_task(services: Services, job: JobRecord, task: PlannedTask, **info: Any) -> ShardManifest:
     """A task of a job done on the spot, in store and index; the index believes `info` in its manifest."""
-    made = make_shard(services.store, message_of(job, task, attempt=1, max_attempt=3))
+    made = make_shard(services.store, create_task_message(job, task, attempt=1, max_attempt=3))
     services.index.write.add_manifests([made.model_copy(update={"info": info}) if info else made])
     return made
 
@@ -144,12 +144,12 @@ def finish(services: Services, job: str, *, batches: float = math.inf, stage: St
 
 def plan_all(services: Services) -> None:
     """Plan all datasets in one round, however slow the machine: cells that are planned at once share the workers."""
-    assert not DatasetRounds(services).advance(math.inf)
+    assert not DatasetController(services).advance(math.inf)
 
 
 def tasks_of(job: JobRecord) -> list[TaskMessage]:
     tasks = [task for task in plan_tasks(job) if task.stage is Stage.SYNTHESIZE]
-    return [message_of(job, task, attempt=1, max_attempt=3) for task in tasks]
+    return [create_task_message(job, task, attempt=1, max_attempt=3) for task in tasks]
 
 
 def fail_task(services: Services, job: str, task: PlannedTask | TaskView, number: int = 1, **changes: Any) -> str:
@@ -161,9 +161,9 @@ def fail_task(services: Services, job: str, task: PlannedTask | TaskView, number
     return key
 
 
-def beat_of(name: str = "w", **changes: Any) -> WorkerBeat:
+def beat_of(name: str = "w", **changes: Any) -> WorkerHeartbeat:
     now = timestamp()
-    beat = WorkerBeat(name, "host", 1, "cpu", "CPU", tuple(Stage), "0", "idle", "", now, now)
+    beat = WorkerHeartbeat(name, "host", 1, "cpu", "CPU", tuple(Stage), "0", "idle", "", now, now)
     return replace(beat, **changes)
 
 
@@ -180,7 +180,7 @@ def job_record(wanted: JobRequest, job: str = "c" * 32) -> JobRecord:
 def message_for(stage: Stage = Stage.SYNTHESIZE, *, attempt: int = 1, **changes: Any) -> TaskMessage:
     job = job_record(request(**changes))
     task = next(task for task in plan_tasks(job) if task.stage is stage)
-    return message_of(job, task, attempt=attempt, max_attempt=3)
+    return create_task_message(job, task, attempt=attempt, max_attempt=3)
 
 
 def hold_interpreter(seconds: float) -> None:

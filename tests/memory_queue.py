@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from graspd.service.model.messages import WorkerBeat
+from graspd.service.model.messages import WorkerHeartbeat
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import Event, Lease, Message, QueueStatus, priority_order
 from graspd.service.queue.rq_queue import RqQueue
@@ -28,7 +28,7 @@ class MemoryQueue(RqQueue):
     _held: dict[str, Delivery] = field(default_factory=dict)
     _cancelled: set[str] = field(default_factory=set)
     _stream: list[Event] = field(default_factory=list)
-    _workers: dict[str, WorkerBeat] = field(default_factory=dict)
+    _workers: dict[str, WorkerHeartbeat] = field(default_factory=dict)
     _announced: dict[str, float] = field(default_factory=dict)
     _service: str | None = None
     _lease: tuple[str, float] = ("", 0.0)
@@ -56,28 +56,28 @@ class MemoryQueue(RqQueue):
         for priority, waiting in self._priorities.items():
             self._priorities[priority] = [m for m in waiting if m.task_id not in set(task_ids)]
 
-    def waiting(self) -> set[str]:
+    def waiting_tasks(self) -> set[str]:
         return {m.task_id for waiting in self._priorities.values() for m in waiting}
 
     def depths(self) -> dict[tuple[Priority, Stage], int]:
         counts = {(one, stage): 0 for one in Priority for stage in Stage}
         return counts | Counter((one, m.stage) for one, waiting in self._priorities.items() for m in waiting)
 
-    def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
+    def remove_unserved_lists(self, present: Collection[WorkerHeartbeat]) -> None:
         pass
 
     def leases(self) -> list[Lease]:
         held = self._held.values()
         return [Lease(one.message.task_id, one.message.attempt, one.key, str(one.beat)) for one in held]
 
-    def holder(self, lease: Lease) -> tuple[str, Message | None]:
+    def lease_holder(self, lease: Lease) -> tuple[str, Message | None]:
         held = self._held.get(lease.key)
         return (held.worker, held.message) if held else ("", None)
 
     def release(self, lease: Lease) -> None:
         self._held.pop(lease.key, None)
 
-    def workers(self) -> list[WorkerBeat]:
+    def workers(self) -> list[WorkerHeartbeat]:
         return list(self._workers.values())
 
     def publish(self, *events: Event) -> None:
@@ -99,7 +99,7 @@ class MemoryQueue(RqQueue):
         left = (i for i in range(len(self._stream)) if str(i + 1) not in self._acknowledged)
         self._read = next(left, len(self._stream))
 
-    def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+    def events_after(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         with self._changed:
             start = len(self._stream) if after == "$" else int(after)
             self._changed.wait_for(lambda: len(self._stream) > start, timeout=wait_s)
@@ -111,10 +111,10 @@ class MemoryQueue(RqQueue):
     def is_announced(self, part: str) -> bool:
         return self._announced.get(part, 0.0) > self.clock()
 
-    def service(self) -> str | None:
+    def service_id(self) -> str | None:
         return self._service
 
-    def set_service(self, identity: str, *, instead: bool = False) -> None:
+    def set_service_id(self, identity: str, *, instead: bool = False) -> None:
         if instead or self._service is None:
             self._service = identity
 
@@ -136,14 +136,14 @@ class MemoryQueue(RqQueue):
         pulses = {name: (beat, 0.0) for name, beat in self._workers.items()}
         return QueueStatus(depth=self.depths(), running=running, workers=pulses)
 
-    def count(self, amounts: Mapping[str, float]) -> None:
+    def add_to_counters(self, amounts: Mapping[str, float]) -> None:
         for name, amount in amounts.items():
             self._sums[name] = self._sums.get(name, 0.0) + amount
 
     def counter_sums(self) -> dict[str, float]:
         return dict(self._sums)
 
-    def tidy(self) -> None:
+    def remove_stale_keys(self) -> None:
         """Nothing is left behind."""
 
     def close(self) -> None:

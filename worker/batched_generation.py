@@ -101,7 +101,7 @@ class _Job:
         """Make one batch after the other."""
         shares = ProgressShares(self.sizes, self.run.progress)
         for k, (count, scenes) in enumerate(zip(self.sizes, self.scenes, strict=True)):
-            own, number = replace(self.run, progress=shares.of(k)), self.first + k
+            own, number = replace(self.run, progress=shares.progress_of_part(k)), self.first + k
             how: dict[str, Any] = {"scenes": scenes, "pieces": self.pieces, "run": own, "partial": self.partial}
             try:
                 made = validated_grasps(self.hand, self.obj, self.request, count=count, batch=number, **how)
@@ -126,7 +126,7 @@ class _Job:
             ThreadPoolExecutor(1, thread_name_prefix="device") as device,
         ):
             fresh = (
-                Batch(scoring, self.first + k, count, replace(run, progress=shares.of(k)), own[k])
+                Batch(scoring, self.first + k, count, replace(run, progress=shares.progress_of_part(k)), own[k])
                 for k, count in enumerate(self.sizes)
             )
             ahead: Future[_Wave] | None = None
@@ -184,7 +184,11 @@ def _plan_wave(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
     for batch in batches:
         assert batch.needed is not None
         wanted = batch.plan_request(batch.needed, rollout, others_have_place=batch.candidates > 0)
-        asked.append(BatchRequest(wanted, batch.run.part(*batch.needed.progress).part(0.0, PARTS[0])))
+        asked.append(
+            BatchRequest(
+                wanted, batch.run.with_progress_range(*batch.needed.progress).with_progress_range(0.0, PARTS[0])
+            )
+        )
     with exclusive:
         made = synthesize_batches(scoring.hand, scoring.obj, asked, method=request.method, options=request.options)
         check_device(scoring.run.device)

@@ -58,13 +58,13 @@ class ExecutionContext:
         every = self.threads or available_cores()
         return every if self.sharing is None else max(1, every // max(1, self.sharing.members))
 
-    def part(self, start: float, end: float) -> ExecutionContext:
+    def with_progress_range(self, start: float, end: float) -> ExecutionContext:
         """Return the context of a part, with progress from `start` to `end` as shares of the whole."""
 
-        def tell(done: float, total: float, message: str) -> None:
+        def report(done: float, total: float, message: str) -> None:
             self.progress(start + (end - start) * (done / total if total > 0 else 0.0), 1.0, message)
 
-        return replace(self, progress=tell)
+        return replace(self, progress=report)
 
     def without_progress(self) -> ExecutionContext:
         return replace(self, progress=DEFAULT_CONTEXT.progress)
@@ -102,13 +102,13 @@ class ProgressShares:
     _done: dict[int, float] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def of(self, part: int) -> Progress:
-        def tell(done: float, total: float, message: str) -> None:
+    def progress_of_part(self, part: int) -> Progress:
+        def report(done: float, total: float, message: str) -> None:
             with self._lock:
                 self._done[part] = self.sizes[part] * (done / total if total > 0 else 0.0)
                 self.told(sum(self._done.values()), sum(self.sizes), message)
 
-        return tell
+        return report
 
 
 def parallel_map(
@@ -124,7 +124,10 @@ def parallel_map(
 
     def run_part(number: int) -> R:
         own = replace(
-            run, sharing=sharing, progress=shares.of(number), cancelled=lambda: stop.is_set() or run.cancelled()
+            run,
+            sharing=sharing,
+            progress=shares.progress_of_part(number),
+            cancelled=lambda: stop.is_set() or run.cancelled(),
         )
         try:
             return work(parts[number], own)
@@ -155,7 +158,7 @@ def evaluate_rows(
     for _ in range(workers):
         tests.put(make())
 
-    def work(row: int) -> R:
+    def evaluate_row(row: int) -> R:
         test = tests.get()
         try:
             return ask(test, row)
@@ -163,7 +166,7 @@ def evaluate_rows(
             tests.put(test)
 
     with ThreadPoolExecutor(workers, thread_name_prefix=name) as pool:
-        return list(pool.map(work, rows))
+        return list(pool.map(evaluate_row, rows))
 
 
 def measure_rows(
@@ -177,11 +180,11 @@ def measure_rows(
 ) -> NDArray[np.float64]:
     """Return measurements (count,), nan for grasps not `held` (count,); if `held` is None, of all grasps."""
 
-    def asked(test: T, row: int) -> float:
+    def evaluate_row(test: T, row: int) -> float:
         run.check("the validator")
         return ask(test, row)
 
     out = np.full(count, np.nan)
     rows = np.arange(count) if held is None else np.flatnonzero(held)
-    out[rows] = evaluate_rows(rows.tolist(), make, asked, threads=run.cores, name=name)
+    out[rows] = evaluate_rows(rows.tolist(), make, evaluate_row, threads=run.cores, name=name)
     return out

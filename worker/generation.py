@@ -34,14 +34,14 @@ from graspd.worker.quality.diversity import POINTS, distinct_mask, hand_points
 from graspd.worker.quality.gate import GATES, failed_gate, passes_gate
 from graspd.worker.quality.table import measure
 from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, expected_need, next_round, select_rows, split_rows
-from graspd.worker.scenes.rollout import lift_level, outcomes_in_scenes, rollout_on, scene_verdicts
+from graspd.worker.scenes.rollout import create_rollout, lift_level, outcome_masks, scene_verdicts
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.lifting import lift_key, validate_lifts
-from graspd.worker.validation.payload import ENOUGH, Limit, limit_of, payloads, shake_margins
+from graspd.worker.validation.payload import ENOUGH, PayloadLimit, payload_limit, payloads, shake_margins
 from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, prefilter_key_terms
 from graspd.worker.validation.protocol import DIRECTIONS, Outcome
 from graspd.worker.validation.robust import reaches_share, validate_robustness
@@ -96,7 +96,7 @@ class ValidatedBatch:
     lift_share: also lifted. lift_hard_share: also lifted at half friction."""
     narrow: str | None = None
     """In scenes without a valid grasp, the geometric reason; see `narrow_reason`."""
-    limit: Limit | None = None
+    limit: PayloadLimit | None = None
     """Payload limit of the tested grasps, if no grasp is selected because the object is too heavy."""
 
     def moved(self, by: Sequence[float]) -> ValidatedBatch:
@@ -189,7 +189,9 @@ class Scoring(AbstractContextManager["Scoring"]):
         if self.pieces is None:
             return None
         pieces, in_scenes = self.pieces.result, self.scenes is not None
-        return rollout_on(self.run, self.hand, self.obj, pieces, in_scenes=in_scenes, known=known, level=self._level)
+        return create_rollout(
+            self.run, self.hand, self.obj, pieces, in_scenes=in_scenes, known=known, level=self._level
+        )
 
     def key(self) -> str:
         assert self.pieces is not None
@@ -231,10 +233,10 @@ class Scoring(AbstractContextManager["Scoring"]):
         size, every = len(planned), self.request.want == "candidates"
         in_scene: dict[str, NDArray[np.bool_]] = {}
         with _timed(seconds, "validation"):
-            planned, columns = self._validate(planned, run.part(*PARTS[:2]), known, prefilter)
+            planned, columns = self._validate(planned, run.with_progress_range(*PARTS[:2]), known, prefilter)
         if self.scenes is not None:
             fates[finite[columns["quality/success"] < 0]] = "no_place"
-            for name, those in outcomes_in_scenes(columns).items():
+            for name, those in outcome_masks(columns).items():
                 in_scene[name] = np.zeros(len(fates), bool)
                 in_scene[name][finite] = those
         why = _rejection_reasons(columns, size)
@@ -243,7 +245,7 @@ class Scoring(AbstractContextManager["Scoring"]):
         columns = {path: array[rows] for path, array in columns.items()}
         with _timed(seconds, "quality"):
             friction = self.request.friction
-            measured = run.part(*PARTS[1:])
+            measured = run.with_progress_range(*PARTS[1:])
             columns |= measure(self.hand, self.obj, grasps, friction=friction, region=required.region, run=measured)
             columns |= required.like_columns(grasps.grasp)
         columns["quality/feasible"] = passes_gate(columns)
@@ -305,12 +307,12 @@ class Scoring(AbstractContextManager["Scoring"]):
         """Return columns of the further tests that the request specifies.
         Grasps `in_models` (N,) are tested for robustness, `valid` grasps (N,) for payload and in the shake test."""
         request, columns = self.request, dict[str, NDArray[Any]]()
-        if not (request.models or request.measures_payload or request.shake):
+        if not (request.model_count or request.measures_payload or request.shake):
             return columns
         assert self.pieces is not None
         common: dict[str, Any] = {"pieces": self.pieces.result(), "run": run}
         placed = self.placed(grasps)
-        if request.models:
+        if request.model_count:
             columns |= validate_robustness(
                 self.hand,
                 self.obj,
@@ -318,7 +320,7 @@ class Scoring(AbstractContextManager["Scoring"]):
                 held=in_models,
                 placed=placed,
                 level=lift_level(request.validation),
-                models=request.models,
+                models=request.model_count,
                 seed=request.seed,
                 wanted=request.robust if request.want == "valid" else 0,
                 **common,
@@ -370,7 +372,7 @@ class Batch:
         self.requirements.check(scoring.hand, scoring.obj)
         self.rounds: list[Round] = []
         self.candidates = self.repeated = 0
-        self.limit: Limit | None = None
+        self.limit: PayloadLimit | None = None
         self.seconds: dict[str, float] = {"planner": 0.0, "validation": 0.0, "quality": 0.0}
         every = range(0 if scoring.scenes is None else len(scoring.scenes.object_pose))
         self._scenes = every if scenes is None else scenes
@@ -429,7 +431,7 @@ class Batch:
             scoring.run.without_progress(),
             max(obj.mass, self.request.min_payload),
         )
-        self.limit = limit_of(hand, obj, planned, wanted=wanted, pieces=pieces, placed=placed, run=run)
+        self.limit = payload_limit(hand, obj, planned, wanted=wanted, pieces=pieces, placed=placed, run=run)
         return self.limit is not None and self.limit.is_far_exceeded
 
     @property
@@ -440,13 +442,18 @@ class Batch:
 
     def run_round(self, asked: RoundRequest) -> Round:
         known: Known = {}
-        run = self.run.part(*asked.progress)
+        run = self.run.with_progress_range(*asked.progress)
         rollout = self.scoring.rollout(known)  # one for all parts
         parts = split_rows(asked.rows, run.cores if self._is_divisible and run.pool is None else 1)
 
         def planned(part: range, own: ExecutionContext, others: bool) -> Round:
             wanted = self.plan_request(replace(asked, rows=part), rollout, others_have_place=others)
-            hand, obj, request, run = self.scoring.hand, self.scoring.obj, self.request, own.part(0.0, PARTS[0])
+            hand, obj, request, run = (
+                self.scoring.hand,
+                self.scoring.obj,
+                self.request,
+                own.with_progress_range(0.0, PARTS[0]),
+            )
             found = synthesize(hand, obj, wanted, run, method=request.method, options=request.options)
             told = self.grasps_to_store(wanted, found)
             # Verdicts and metrics are many short tasks: they may use all cores, also while other parts run.
@@ -466,7 +473,7 @@ class Batch:
             planned(part, run.without_progress(), True) if isinstance(one, NoStartFound) else one
             for part, one in zip(parts, found, strict=True)
         ]
-        whole = Round.joined(made)
+        whole = Round.concatenate(made)
         whole.seconds = {name: value / len(made) for name, value in whole.seconds.items()}
         return whole
 
@@ -478,7 +485,7 @@ class Batch:
             beside = poses.neighbour_pose[own] if poses.neighbours else poses.neighbour_pose
             mine = replace(poses, object_pose=poses.object_pose[own], neighbour_pose=beside)
             placed = mine.placed((asked.begun + np.array(rows)) % len(self._scenes))
-        knobs, seed = self.request.knobs, self.request.seed
+        knobs, seed = self.request.resolved_fidelity, self.request.seed
         wanted = self.requirements
         return PlanRequest(len(rows), knobs, seed, number, placed, rollout, rows.start, wanted, others_have_place)
 

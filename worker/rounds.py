@@ -41,7 +41,7 @@ class Round:
     planned: list[GraspSet] = field(default_factory=list)
 
     @classmethod
-    def joined(cls, parts: Sequence[Round]) -> Round:
+    def concatenate(cls, parts: Sequence[Round]) -> Round:
         in_scene = {name: np.concatenate([part.in_scene[name] for part in parts]) for name in parts[0].in_scene}
         firsts = accumulate((len(part.fates) for part in parts), initial=0)
         seconds = {name: sum(part.seconds[name] for part in parts) for name in parts[0].seconds}

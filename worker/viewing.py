@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
-from graspd.service.model.scene_spec import Box, SceneSpec, supports_in
+from graspd.service.model.scene_spec import Box, SceneSpec, scene_supports
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
 from graspd.service.readers.trajectories import (
     Waypoint,
-    point_at,
     scene_spec_of,
     slider_positions,
     trajectory_of,
-    wrists_of,
+    waypoint_at,
+    wrist_angles,
 )
 from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
@@ -66,22 +66,24 @@ class Models:
     def _mesh(self, path: str, solid: Any, colour: tuple[int, ...]) -> Any:
         return self._scene.add_mesh_simple(path, solid.vertices, solid.faces, color=colour, flat_shading=True)
 
-    def surround(self, supports: Supports, object_pose: Floats, neighbours: Neighbours | None, number: int) -> None:
+    def show_surroundings(
+        self, supports: Supports, object_pose: Floats, neighbours: Neighbours | None, number: int
+    ) -> None:
         """Rebuild the scene around an object at a pose (7,); `number` selects the scene's neighbour poses."""
         for node in self._around:
             node.remove()
         self._around = []
-        _place(self.rest, object_pose)
+        _set_pose(self.rest, object_pose)
         poses = slab_poses(supports, object_pose[:3], 0.0)
         for k, (support, slab, pose) in enumerate(zip(supports, slabs(supports), poses, strict=True)):
             look = {"color": _WALL, "opacity": 0.35} if isinstance(support, Box) else {"color": _TABLE}
             node = self._scene.add_box(f"/scene/support{k}", dimensions=slab.size, cast_shadow=False, **look)
-            _place(node, pose)
+            _set_pose(node, pose)
             self._around.append(node)
         if neighbours is not None:
             for k, other in enumerate(neighbours.objects):
                 node = self._mesh(f"/scene/neighbour{k}", other, _NEIGHBOUR)
-                _place(node, neighbours.poses[number, k])
+                _set_pose(node, neighbours.poses[number, k])
                 self._around.append(node)
 
     def show_scene(self, on: bool) -> None:
@@ -93,7 +95,7 @@ class Models:
         Return distances (P,) of hand points from the object [m], at most the probe's reach."""
         posture = point.hand_pose[None], point.joint_positions[None]
         for node, pose in zip(self.bodies, drawn_poses(self._hand, *posture, wrist)[0], strict=True):
-            _place(node, pose)
+            _set_pose(node, pose)
         self.thing.position = point.carried
         # The probe's object stays at its rest pose.
         points = self._probe.posed_points(body_poses(self._hand, *posture))[0] - point.carried
@@ -113,7 +115,7 @@ class Models:
         return distance
 
 
-def _place(node: Any, pose: Floats) -> None:
+def _set_pose(node: Any, pose: Floats) -> None:
     node.position = pose[:3]
     node.wxyz = pose[3:] / np.linalg.norm(pose[3:])
 
@@ -162,20 +164,20 @@ class Viewer:
         self._rows = next(iter(self._choices.values()))
         self._at, self._lock = 0, threading.RLock()
         spec = scene_spec_of(shown.shard) or SceneSpec()
-        self._supports: Supports = supports_in(spec)
-        self.server = _served(host, port)
+        self._supports: Supports = scene_supports(spec)
+        self.server = _start_server(host, port)
         self.models = Models(self.server.scene, shown.hand, shown.obj, mounted=self._wrist is not None)
         self._way = trajectory_of(shown.shard, self.row)
         self._controls()
-        self._load()
-        self._aim()
+        self._load_grasp()
+        self._aim_camera()
 
     def __repr__(self) -> str:
         return f"<viewer at {self.url}>"
 
     @property
     def _wrist(self) -> Floats | None:
-        return wrists_of(self._shown.shard, np.array([self.row]))
+        return wrist_angles(self._shown.shard, np.array([self.row]))
 
     @property
     def url(self) -> str:
@@ -196,13 +198,13 @@ class Viewer:
         """Advance by `by` grasps, cyclically."""
         with self._lock:
             self._at = (self._at + by) % len(self._rows)
-            self._load()
+            self._load_grasp()
 
     def choose(self, name: str) -> None:
         """Show only one kind of grasps, named in `Viewer.filters`."""
         with self._lock:
             self._rows, self._at = self._choices[name], 0
-            self._load()
+            self._load_grasp()
 
     @property
     def filters(self) -> tuple[str, ...]:
@@ -213,7 +215,7 @@ class Viewer:
         """Draw the posture at the slider's position."""
         with self._lock:
             place = float(self.slider.value)
-            point, contacts = point_at(self._way, place), bool(self._contacts.value)
+            point, contacts = waypoint_at(self._way, place), bool(self._contacts.value)
             distance = self.models.pose(point, wrist=self._wrist, contacts=contacts)
             self.models.show_scene(bool(self._scene.value))
             touching, least = int((distance < 0.001).sum()), 1e3 * float(distance.min())
@@ -249,20 +251,20 @@ class Viewer:
         for control in (self.slider, self._contacts, self._scene):
             control.on_update(lambda _: self.show())
 
-    def _load(self) -> None:
+    def _load_grasp(self) -> None:
         shard, row = self._shown.shard, self.row
         self._way = trajectory_of(shard, row)
         number = int(self._arrays["grasp/scene_index"][row]) if "grasp/scene_index" in self._arrays else 0
         pose = np.asarray(self._arrays["scene/object_pose"][number], float) if self._supports else IDENTITY_POSE
-        self.models.surround(self._supports, pose, self._shown.neighbours, number)
+        self.models.show_surroundings(self._supports, pose, self._shown.neighbours, number)
         said = shard.attributes
         self._title.content = (
             f"**{said.get('hand')} × {said.get('object')}**, grasp {self._at + 1} of {len(self._rows)} (row {row})"
         )
-        self._figures.content = _figures(shard, row)
+        self._figures.content = _metrics_text(shard, row)
         self.show()
 
-    def _aim(self) -> None:
+    def _aim_camera(self) -> None:
         """Look at the object from a side that no support hides, if possible perpendicular to the approach."""
         pose = np.concatenate([self.models.rest.position, self.models.rest.wxyz])
         points = quat_rotate(pose[3:], self._shown.obj.hull_vertices) + pose[:3]
@@ -279,7 +281,7 @@ class Viewer:
         camera.position, camera.look_at, camera.up, camera.fov = eye, middle, (0.0, 0.0, 1.0), 0.75
 
 
-def _served(host: str, port: int) -> Any:
+def _start_server(host: str, port: int) -> Any:
     import viser
 
     try:
@@ -306,7 +308,7 @@ def _rows_by_filter(shard: Shard) -> dict[str, NDArray[np.intp]]:
     return found | {"all": np.arange(count)}
 
 
-def _figures(shard: Shard, row: int) -> str:
+def _metrics_text(shard: Shard, row: int) -> str:
     arrays = shard.arrays
     rows = [("ε at 5 mm", f"{metric_at_threshold(arrays, 'quality/epsilon')[row]:.3f}")]
     rows.append(("penetration", f"{float(arrays['quality/penetration_depth_mm'][row]):.2f} mm"))

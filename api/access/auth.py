@@ -52,7 +52,7 @@ def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
     """Return the key of a request, or None while no key is needed; raise ApiError 401 or 403."""
     keys: KeyFile = request.app.state.keys
     if keys.is_open:
-        _refuse_strangers(request)
+        _require_local_request(request)
         return None
     key: Key | None = request.scope.get("state", {}).get("key")
     if key is None:
@@ -68,7 +68,7 @@ def is_still_authorized(request: HTTPConnection, scope: Scope) -> bool:
     keys: KeyFile = request.app.state.keys
     if keys.is_open:
         return True
-    key = identify(request.scope, keys, request.app.state.proxy)
+    key = authenticate(request.scope, keys, request.app.state.proxy)
     return key is not None and key.scope.includes(scope)
 
 
@@ -98,7 +98,7 @@ def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
     return True
 
 
-def _refuse_strangers(request: HTTPConnection) -> None:
+def _require_local_request(request: HTTPConnection) -> None:
     """Refuse requests from other machines, and from proxies, because these may forward any request."""
     header = next((name for name in _OF_PROXIES if name in request.headers), None)
     address = request.client.host if request.client else ""
@@ -108,7 +108,7 @@ def _refuse_strangers(request: HTTPConnection) -> None:
         raise ApiError(403, f"{problem}; make a key with `graspd keys add NAME --scope admin`")
 
 
-def identify(scope: AsgiScope, keys: KeyFile, proxy: Proxy) -> Key | None:
+def authenticate(scope: AsgiScope, keys: KeyFile, proxy: Proxy) -> Key | None:
     """Return the key of a request: by its Bearer token, by the proxy, or by its session cookie."""
     scheme, _, token = Headers(scope=scope).get("authorization", "").partition(" ")
     if scheme.lower() == "bearer" and token:
@@ -144,8 +144,8 @@ class Proxy:
         if secret and len(secret) < _LEAST_SECRET:
             raise InputError(f"GRASPD_PROXY_SECRET is shorter than {_LEAST_SECRET} characters; take a random one")
         self._secret = secret.encode()
-        self._networks = [_network(one) for one in (settings.proxy_addresses or "").replace(",", " ").split()]
-        self._groups = {group: _rights(group, said) for group, said in settings.proxy_groups.items()}
+        self._networks = [_parse_network(one) for one in (settings.proxy_addresses or "").replace(",", " ").split()]
+        self._groups = {group: _parse_group(group, said) for group, said in settings.proxy_groups.items()}
 
     @property
     def is_on(self) -> bool:
@@ -162,7 +162,7 @@ class Proxy:
             return None
         theirs = {group.strip() for group in (groups[0] if groups else "").split(",")} | {ANYBODY}
         rights = next((rights for group, rights in self._groups.items() if group in theirs), None)
-        return None if rights is None else _key_of(user, *rights)
+        return None if rights is None else _proxy_user_key(user, *rights)
 
     def _is_from_proxy(self, scope: AsgiScope) -> bool:
         try:
@@ -185,21 +185,21 @@ class Proxy:
         return name if len(name) <= _LONGEST_USER and _USER.fullmatch(name) else ""
 
 
-def _key_of(user: str, project: str, scope: Scope) -> Key:
+def _proxy_user_key(user: str, project: str, scope: Scope) -> Key:
     digest = hashlib.sha256(f"proxy {user}".encode()).hexdigest()
     # Names of stored keys contain no @, so that people and keys have separate counters.
     name = user[:48] if "@" in user else f"{user[:48]}@proxy"
     return Key(id=digest[:16], name=name, scope=scope, project=project, sha256=digest, created="")
 
 
-def _network(text: str) -> ipaddress.IPv4Network | ipaddress.IPv6Network:
+def _parse_network(text: str) -> ipaddress.IPv4Network | ipaddress.IPv6Network:
     try:
         return ipaddress.ip_network(text)
     except ValueError:
         raise InputError(f"GRASPD_PROXY_ADDRESSES: {text!r} is not an address; write 10.0.0.5 or 10.0.0.0/24") from None
 
 
-def _rights(group: str, said: str) -> tuple[str, Scope]:
+def _parse_group(group: str, said: str) -> tuple[str, Scope]:
     project, _, scope = said.partition(":")
     if (project and not re.fullmatch(PATTERN, project)) or scope not in set(Scope):
         fix = "write vision:submit, or :admin"

@@ -73,7 +73,7 @@ class Key(BaseModel):
     limits: KeyLimits = KeyLimits()
 
     @model_validator(mode="after")
-    def _has_an_id(self) -> Self:
+    def _add_missing_id(self) -> Self:
         # Keys of an earlier version have no id; both secrets of a rotation share the name, and so get the same id.
         self.id = self.id or _sha256(f"name {self.name}")[:16]
         return self
@@ -123,7 +123,7 @@ class KeyFile:
     ) -> str:
         """Make a key and return it; it cannot be shown again. An empty project is the unnamed project."""
         token = PREFIX + secrets.token_urlsafe(32)
-        with self._changing() as document:
+        with self._edit_document() as document:
             if any(key.name == name and key.is_live for key in document.keys):
                 raise ConflictError(f"there is a key named {name!r}; revoke or rotate it, or take another name")
             if "@" in name:
@@ -141,7 +141,7 @@ class KeyFile:
                 )
             except ValidationError as error:
                 if error.errors()[0]["loc"] == ("project",):
-                    raise InputError(_no_project(project)) from None
+                    raise InputError(_project_name_error(project)) from None
                 raise InputError(f"{name!r} is no key name; use letters, digits, dot, dash and underscore") from None
             document.keys.append(key)
         return token
@@ -149,8 +149,8 @@ class KeyFile:
     def rotate(self, name: str, *, grace: timedelta = timedelta(0), lifetime: timedelta | None = None) -> str:
         """Return a new secret of a key; the old one stays valid for `grace`; scope, project, limits persist."""
         token = PREFIX + secrets.token_urlsafe(32)
-        with self._changing() as document:
-            old = _live(document, name)
+        with self._edit_document() as document:
+            old = _live_keys(document, name)
             dates = {"created": _now(), "expires": _now(lifetime) if lifetime else None}
             fresh = old[-1].model_copy(update={"sha256": _sha256(token), **dates})
             for key in old:
@@ -161,9 +161,9 @@ class KeyFile:
             document.keys.append(fresh)
         return token
 
-    def limit(self, name: str, limits: KeyLimits) -> KeyLimits:
-        with self._changing() as document:
-            for key in (found := _live(document, name)):
+    def set_limits(self, name: str, limits: KeyLimits) -> KeyLimits:
+        with self._edit_document() as document:
+            for key in (found := _live_keys(document, name)):
                 key.limits = key.limits.model_copy(update=limits.model_dump(exclude_unset=True))
         return found[-1].limits
 
@@ -177,20 +177,20 @@ class KeyFile:
 
     def limit_project(self, project: str, limits: ProjectLimits) -> ProjectLimits:
         if not re.fullmatch(PATTERN, project):
-            raise InputError(_no_project(project))
-        with self._changing() as document:
+            raise InputError(_project_name_error(project))
+        with self._edit_document() as document:
             known = document.projects.get(project, ProjectLimits())
             document.projects[project] = known.model_copy(update=limits.model_dump(exclude_unset=True))
         return document.projects[project]
 
     def revoke(self, name: str) -> None:
-        with self._changing() as document:
-            for key in _live(document, name):
+        with self._edit_document() as document:
+            for key in _live_keys(document, name):
                 key.revoked = _now()
 
     def find(self, token: str) -> Key | None:
         digest = _sha256(token)
-        return self._first(lambda key: hmac.compare_digest(key.sha256, digest))
+        return self._find_live_key(lambda key: hmac.compare_digest(key.sha256, digest))
 
     def open_session(self, key: Key) -> str:
         """Return a signed cookie for a browser that presented a key."""
@@ -207,9 +207,9 @@ class KeyFile:
         digest, expires = json.loads(base64.urlsafe_b64decode(claim))
         if time.time() > expires:
             return None
-        return self._first(lambda key: key.sha256 == digest)
+        return self._find_live_key(lambda key: key.sha256 == digest)
 
-    def _first(self, is_it: Callable[[Key], bool]) -> Key | None:
+    def _find_live_key(self, is_it: Callable[[Key], bool]) -> Key | None:
         return next((key for key in self._read().keys if is_it(key) and key.is_live), None)
 
     def _sign(self, claim: str) -> str:
@@ -232,7 +232,7 @@ class KeyFile:
         return self._document
 
     @contextmanager
-    def _changing(self) -> Iterator[_Document]:
+    def _edit_document(self) -> Iterator[_Document]:
         """Yield a copy of the document, then write it to the file; a lock serialises commands."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -254,11 +254,11 @@ class KeyFile:
         draft.replace(self.path)
 
 
-def _no_project(name: str) -> str:
+def _project_name_error(name: str) -> str:
     return f"{name!r} is no name of a project; use up to 32 lower-case letters, digits and dashes"
 
 
-def _live(document: _Document, name: str) -> list[Key]:
+def _live_keys(document: _Document, name: str) -> list[Key]:
     found = [key for key in document.keys if key.name == name and key.is_live]
     if not found:
         raise NotFoundError(f"there is no valid key named {name!r}; `graspd keys list` shows them")

@@ -162,13 +162,13 @@ class Quotas:
         if key is None:
             yield claim
             return
-        self._refuse_spent(key.project)
+        self._check_gpu_seconds(key.project)
         with ExitStack() as claimed:
             for holder in self._holders(key):
-                claimed.enter_context(self._counted(holder, claim, job, grasps, is_new=is_new))
+                claimed.enter_context(self._count_claim(holder, claim, job, grasps, is_new=is_new))
             yield claim
 
-    def _refuse_spent(self, project: str) -> None:
+    def _check_gpu_seconds(self, project: str) -> None:
         """Raise QuotaError if a project's GPU seconds of today are used up; its earlier jobs continue."""
         most = self._limits_of(project).gpu_seconds_per_day if project else None
         if most and (used := self._gpu_seconds(project, f"{datetime.now(UTC):%Y-%m-%d}")) >= most:
@@ -188,7 +188,7 @@ class Quotas:
         return [holder for holder in found if holder.grasps or holder.today]
 
     @contextmanager
-    def _counted(
+    def _count_claim(
         self, holder: _Holder, claim: SubmissionClaim, job: str, grasps: int, *, is_new: bool
     ) -> Iterator[None]:
         number = uuid.uuid4().hex

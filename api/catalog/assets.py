@@ -14,7 +14,7 @@ from graspd.service.index.views import AssetView, Page
 from graspd.service.model import names
 from graspd.service.model.digests import digest_files
 from graspd.service.model.errors import ConflictError, DamagedError, LimitError, NotFoundError
-from graspd.service.model.names import MOST, shorten
+from graspd.service.model.names import MOST, shorten_name
 from graspd.service.model.projects import EVERYTHING, ProjectScope, project_mark
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline import deletion
@@ -26,8 +26,8 @@ from graspd.service.store.descriptions import (
     HandCorrections,
     HandFacts,
     apply_corrections,
-    facts_of,
-    json_object,
+    parse_json_object,
+    read_hand_facts,
 )
 from graspd.service.store.integrity import get_sealed, put_document
 from graspd.service.store.network_file import network_report
@@ -48,7 +48,7 @@ class Assets:
         scope = project_scope()
         return self._services.index.assets.page(kind, limit=limit, cursor=cursor, refused=refused, scope=scope)
 
-    def one(self, kind: AssetKind, name: str) -> AssetView:
+    def get(self, kind: AssetKind, name: str) -> AssetView:
         return self._services.index.assets.get(kind, name, scope=project_scope())
 
     def files(self, asset: AssetView) -> Mapping[str, bytes]:
@@ -75,13 +75,13 @@ class Assets:
         """
         found = network_report(files, name) if kind is AssetKind.NETWORK else None
         project = project_scope().project
-        digest = self._mark(kind, name, files, "" if shared else project)
+        digest = self._add_project_mark(kind, name, files, "" if shared else project)
         known = self._find(kind, digest)
         if known is None and self._find(kind, digest, EVERYTHING):
             raise ConflictError(f"this {kind.value} is private to another project; upload it without `shared`")
         if known and (rename or known.verdict == "refuse"):
             return known
-        if rename and self._holder(kind, name):
+        if rename and self._digest_of_name(kind, name):
             name = self._next_name(kind, name)
         self._check_name(kind, name, digest)
         index, store = self._services.index, self._services.store
@@ -95,21 +95,21 @@ class Assets:
             self._check_name(kind, name, asset.digest)
             asset = library.record_asset(store, asset, put)
             index.write.add_asset(asset, library.load_check(store, kind, asset.digest), within=connection)
-        return self.one(kind, asset.digest)
+        return self.get(kind, asset.digest)
 
     def hand_facts(self, asset: AssetView) -> HandFacts:
         """Return facts and guesses about a hand; raise ConflictError if an older version made its model."""
-        return facts_of(self.model(asset))
+        return read_hand_facts(self.model(asset))
 
     def correct(self, name: str, corrections: HandCorrections, new_name: str = "") -> AssetView:
         """Create a hand from the same files with corrected facts; by default its name gets a number."""
-        hand = self.one(AssetKind.HAND, name)
+        hand = self.get(AssetKind.HAND, name)
         facts = self.hand_facts(hand)
         archive = self._services.store.get(names.asset_files_key(AssetKind.HAND, hand.digest))
         files = ZipFiles(io.BytesIO(archive), limit_bytes=library.UNPACKED_LIMIT_BYTES)
         if digest_files(AssetKind.HAND, files) != hand.digest:
             raise DamagedError(f"the files of the hand {hand.name!r} in the store are damaged; upload it again")
-        said = json_object(asset_json(files), "asset.json")
+        said = parse_json_object(asset_json(files), "asset.json")
         text = json.dumps(apply_corrections(said, facts, corrections)).encode()
         if len(text) > MAX_BYTES:
             raise LimitError(f"the corrected asset.json exceeds {MAX_BYTES} bytes; give fewer corrections")
@@ -125,19 +125,19 @@ class Assets:
         stem, _, number = name.rpartition("-")
         stem, first = (stem, int(number) + 1) if stem and number.isdigit() and len(number) < 4 else (name, 2)
         for tried in range(first, first + _NAMES_TRIED):
-            named = f"{shorten(stem, MOST - 5)}-{tried}"
-            if not self._holder(kind, named):
+            named = f"{shorten_name(stem, MOST - 5)}-{tried}"
+            if not self._digest_of_name(kind, named):
                 return named
         raise ConflictError(f"there are many {kind.value}s named {stem}-...; choose a name")
 
     def delete(self, kind: AssetKind, name: str) -> None:
-        asset = self.one(kind, name)
+        asset = self.get(kind, name)
         if not asset.builtin:
             require_ownership(asset.owner, f"{kind.value} {name!r}", asset.project)
         deletion.delete_asset(self._services, kind, asset.digest, owner=caller_id(), scope=project_scope())
         log.info("%s %s deleted", kind, asset.name)
 
-    def _mark(self, kind: AssetKind, name: str, files: MutableMapping[str, bytes], project: str) -> str:
+    def _add_project_mark(self, kind: AssetKind, name: str, files: MutableMapping[str, bytes], project: str) -> str:
         """Make the files private to the project by adding its mark; return their digest."""
         files.update(project_mark(files, ""))
         digest = digest_files(kind, files)
@@ -156,11 +156,11 @@ class Assets:
         except NotFoundError:
             return None
 
-    def _holder(self, kind: AssetKind, name: str) -> str:
+    def _digest_of_name(self, kind: AssetKind, name: str) -> str:
         """Return the digest that a name refers to; empty if only other projects or refused uploads have it."""
         known = self._find(kind, name, replace(project_scope(), everything=False))
         return known.digest if known and known.verdict != "refuse" else ""
 
     def _check_name(self, kind: AssetKind, name: str, digest: str) -> None:
-        if self._holder(kind, name) not in ("", digest):
+        if self._digest_of_name(kind, name) not in ("", digest):
             raise ConflictError(f"there is another {kind.value} named {name!r}; give this one another name")

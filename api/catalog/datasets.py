@@ -23,7 +23,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.spec import DatasetRequest, Estimate, Matrix
-from graspd.service.pipeline.fidelity_choice import Resolver
+from graspd.service.pipeline.fidelity_choice import FidelityResolver
 from graspd.service.store.records import load_snapshot
 
 log = logging.getLogger(__name__)
@@ -37,19 +37,19 @@ class Datasets:
         self._quotas = quotas
 
     def create(self, request: DatasetRequest) -> DatasetView:
-        hands, objects = actions.members(self._services, request, project_scope())
+        hands, objects = actions.resolve_members(self._services, request, project_scope())
         asked = len(hands) * len(objects) * request.grasps
         with self._quotas.claim(caller.get(), DATASET_PREFIX + request.name, asked) as claim:
             dataset, claim.counts = actions.create(self._services, request, owner=caller_id(), scope=project_scope())
         return dataset
 
     def cancel(self, name: str) -> DatasetView:
-        self._owned(name)
+        self._get_owned(name)
         return actions.cancel(self._services, name)
 
     def retry(self, name: str) -> DatasetView:
         """Restart a dataset; restarted cells count against the quota."""
-        dataset = self._owned(name)
+        dataset = self._get_owned(name)
         again = dataset.states[State.FAILED] + dataset.states[State.CANCELLED]
         grasps = again * dataset.options.grasps
         with self._quotas.claim(caller.get(), DATASET_PREFIX + name, grasps, is_new=False):
@@ -57,17 +57,17 @@ class Datasets:
 
     def delete(self, name: str, *, with_snapshots: bool = False) -> None:
         """Delete an ended dataset; one with snapshots requires `with_snapshots`."""
-        self._owned(name)
+        self._get_owned(name)
         deletion.delete_dataset(self._services, name, owner=caller_id(), with_snapshots=with_snapshots)
         log.info("dataset %s deleted", name)
 
     def estimate(self, matrix: Matrix) -> Estimate:
-        return estimate(self._services.index, matrix, Resolver(self._services.store), scope=project_scope())
+        return estimate(self._services.index, matrix, FidelityResolver(self._services.store), scope=project_scope())
 
     def page(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
         return self._services.index.datasets.page(limit=limit, cursor=cursor, scope=project_scope())
 
-    def one(self, name: str) -> DatasetView:
+    def get(self, name: str) -> DatasetView:
         return self._services.index.datasets.get(name, scope=project_scope())
 
     def cells(
@@ -90,14 +90,14 @@ class Datasets:
 
     def take_snapshot(self, name: str) -> tuple[Snapshot, bool]:
         """Record the dataset's present shards; return the snapshot, and whether it is new."""
-        self.one(name)
+        self.get(name)
         return actions.take_snapshot(self._services, name)
 
     def snapshots(self, name: str, *, limit: int = 50, cursor: str | None = None) -> Page[SnapshotView]:
         return self._services.index.datasets.snapshots(name, limit=limit, cursor=cursor, scope=project_scope())
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
-        self.one(name)
+        self.get(name)
         return load_snapshot(self._services.store, name, digest)
 
     def add_object_set(self, name: str, objects: tuple[str, ...]) -> ObjectSetView:
@@ -112,25 +112,27 @@ class Datasets:
         )
 
     def object_sets(self) -> list[ObjectSetView]:
-        return self._services.index.object_sets.newest(scope=project_scope())
+        return self._services.index.object_sets.newest_versions(scope=project_scope())
 
     def object_set(self, name: str) -> ObjectSetView:
         return self._services.index.object_sets.get(name, scope=project_scope())
 
     def compare(self, one: str, other: str) -> Comparison:
-        both = self.one(one), self.one(other)
-        filters = [GraspFilter(dataset=each.name, valid=each.options.standing == "valid" or None) for each in both]
+        both = self.get(one), self.get(other)
+        filters = [
+            GraspFilter(dataset=each.name, valid=each.options.displayed_status == "valid" or None) for each in both
+        ]
         metrics = self._services.index.statistics.compare_distributions(filters, MEAN_METRICS)
         few = max(each.cells for each in both) <= MOST_CELLS
-        return Comparison(*both, list(_settings(*both)), self._pairs(one, other) if few else [], metrics)
+        return Comparison(*both, list(_differing_settings(*both)), self._cell_pairs(one, other) if few else [], metrics)
 
-    def _pairs(self, one: str, other: str) -> list[Pair]:
+    def _cell_pairs(self, one: str, other: str) -> list[CellPair]:
         cells = [{(cell.hand, cell.object): cell for cell in self.all_cells(name)} for name in (one, other)]
         names = sorted({*cells[0], *cells[1]})
-        return [Pair(*name, cells[0].get(name), cells[1].get(name)) for name in names]
+        return [CellPair(*name, cells[0].get(name), cells[1].get(name)) for name in names]
 
-    def _owned(self, name: str) -> DatasetView:
-        dataset = self.one(name)
+    def _get_owned(self, name: str) -> DatasetView:
+        dataset = self.get(name)
         require_ownership(dataset.owner, f"dataset {name!r}", dataset.project)
         return dataset
 
@@ -141,7 +143,7 @@ _AT_ONCE: Final = 200
 
 
 @dataclass(frozen=True)
-class Pair:
+class CellPair:
     """Hand and object with their cell in each dataset; None if a dataset has no such cell."""
 
     hand: str
@@ -162,27 +164,27 @@ class Comparison:
     other: DatasetView
     settings: list[tuple[str, str, str]]
     """Options that differ, with both values."""
-    pairs: list[Pair]
+    pairs: list[CellPair]
     """Ordered by hand; empty if a dataset has more than `MOST_CELLS` cells."""
     metrics: dict[Metric, list[Distribution | None]]
     """Distributions of both datasets in the same bins, each over its valid grasps if it requests these, else all."""
 
 
-def _settings(one: DatasetView, other: DatasetView) -> Iterator[tuple[str, str, str]]:
+def _differing_settings(one: DatasetView, other: DatasetView) -> Iterator[tuple[str, str, str]]:
     """Yield options that differ, with both values; then hands and objects that only one dataset has."""
     said = [each.options.model_dump(mode="json") for each in (one, other)]
     for name in said[0]:
         if said[0][name] != said[1][name]:
-            yield name.replace("_", " "), _text(said[0][name]), _text(said[1][name])
+            yield name.replace("_", " "), _setting_text(said[0][name]), _setting_text(said[1][name])
     for name in ("hands", "objects"):
         first, second = (set(getattr(each, name)) for each in (one, other))
         if first != second:
-            yield f"{name} of its own", _text(sorted(first - second)), _text(sorted(second - first))
+            yield f"{name} of its own", _setting_text(sorted(first - second)), _setting_text(sorted(second - first))
 
 
-def _text(value: Any) -> str:
+def _setting_text(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(map(str, value)) or "–"
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_text(one)}" for name, one in value.items()) or "–"
+        return ", ".join(f"{name} {_setting_text(one)}" for name, one in value.items()) or "–"
     return "–" if value in (None, "") else str(value)

@@ -23,7 +23,7 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import ConflictError, LimitError, UnavailableError
 from graspd.service.model.projects import ProjectScope
-from graspd.service.model.webhooks import MOST_HOOKS, End, Webhook, check_url, secret_of
+from graspd.service.model.webhooks import MOST_HOOKS, End, Webhook, check_url, derive_secret
 from graspd.service.pipeline.backends import Services, record_transaction
 
 log = logging.getLogger(__name__)
@@ -53,11 +53,11 @@ async def job_events(jobs: Jobs, job_id: str, request: Request) -> AsyncIterator
         await asyncio.sleep(POLL_S)
 
 
-async def ends(webhooks: Webhooks, since: int, request: Request) -> AsyncIterator[ServerSentEvent]:
+async def end_events(webhooks: Webhooks, since: int, request: Request) -> AsyncIterator[ServerSentEvent]:
     """Send `end` for each job or dataset that ended after number `since`."""
     while not await request.is_disconnected() and is_still_authorized(request, Scope.READ):
         try:
-            found = await run_sync(partial(webhooks.ends, since, limit=_ENDS_AT_ONCE))
+            found = await run_sync(partial(webhooks.end_events, since, limit=_ENDS_AT_ONCE))
         except UnavailableError as error:
             yield ServerSentEvent(event="unavailable", data={"detail": str(error)}, retry=RETRY_MS)
             await asyncio.sleep(RETRY_MS / 1000)
@@ -87,8 +87,8 @@ class Webhooks:
     def __init__(self, services: Services) -> None:
         self._services = services
 
-    def ends(self, since: int, *, limit: int) -> list[EndView]:
-        return self._services.index.outbox.ends(since, limit=limit, scope=project_scope())
+    def end_events(self, since: int, *, limit: int) -> list[EndView]:
+        return self._services.index.outbox.end_events(since, limit=limit, scope=project_scope())
 
     def add(self, url: str, states: tuple[End, ...]) -> tuple[WebhookView, str]:
         """Add a webhook; return it with its secret, which cannot be shown again."""
@@ -105,24 +105,24 @@ class Webhooks:
             self._services.index.outbox.add(hook, within=connection)
         key = caller.get()
         log.info("webhook %s made by %s", hook.id, key.name if key else "this machine")
-        return self._services.index.outbox.webhook(hook.id), secret_of(master.get_secret_value(), hook.id)
+        return self._services.index.outbox.webhook(hook.id), derive_secret(master.get_secret_value(), hook.id)
 
     def all(self) -> list[WebhookView]:
         """Return only webhooks that the caller may change, because their addresses may contain credentials."""
         hooks = self._services.index.outbox.webhooks(scope=project_scope())
         return [hook for hook in hooks if may_change(hook.owner, hook.project)]
 
-    def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
-        return self._services.index.outbox.log(self._owned(webhook).id, limit=limit)
+    def deliveries(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
+        return self._services.index.outbox.delivery_log(self._get_owned(webhook).id, limit=limit)
 
     def delete(self, webhook: str) -> None:
-        hook = self._owned(webhook)
+        hook = self._get_owned(webhook)
         # The record goes first: an interrupted deletion then leaves only a row, which a rebuild drops.
         self._services.store.delete(names.webhook_key(hook.id))
         self._services.index.outbox.remove(hook.id)
         log.info("webhook %s deleted", hook.id)
 
-    def _owned(self, webhook: str) -> WebhookView:
+    def _get_owned(self, webhook: str) -> WebhookView:
         hook = self._services.index.outbox.webhook(webhook, scope=project_scope())
         require_ownership(hook.owner, f"webhook {webhook}", hook.project)
         return hook

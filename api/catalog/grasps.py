@@ -24,7 +24,7 @@ from graspd.service.model.metrics import (
     indexed_metrics,
 )
 from graspd.service.model.records import MOST_TAGGED, Grasp
-from graspd.service.model.scene_spec import supports_in
+from graspd.service.model.scene_spec import scene_supports
 from graspd.service.pipeline.backends import Services
 from graspd.service.readers.trajectories import scene_spec_of, slider_positions, trajectory_of
 from graspd.service.store.columns import LIFT_OUTCOMES, PUSH_OUTCOMES
@@ -52,9 +52,9 @@ class Grasps:
         sort = GraspSort(by=query.sort, descending=query.order == "desc")
         return self._index.grasps.page(self._filter(query), sort=sort, limit=limit, cursor=cursor)
 
-    def members(self, query: models.GraspQuery) -> list[Grasp]:
+    def matching_grasps(self, query: models.GraspQuery) -> list[Grasp]:
         """Return identifiers of all grasps that pass every filter; raise LimitError beyond MOST_TAGGED."""
-        found = self._index.grasps.members(self._filter(query), limit=MOST_TAGGED + 1)
+        found = self._index.grasps.matching_grasps(self._filter(query), limit=MOST_TAGGED + 1)
         if len(found) > MOST_TAGGED:
             raise LimitError(f"more than {MOST_TAGGED} grasps pass this filter, the maximum of a selection; narrow it")
         return found
@@ -70,12 +70,12 @@ class Grasps:
         found = query.model_dump(include=_SHARED) | {
             "project": None if seen.everything else seen.project,
             "tag": query.tag and self._index.tags.id_of(query.tag, scope=seen),
-            "at_least": _bounds(query, "min"),
-            "at_most": _bounds(query, "max"),
+            "at_least": _metric_bounds(query, "min"),
+            "at_most": _metric_bounds(query, "max"),
         }
         return GraspFilter(**found)
 
-    def one(self, shard_id: str, row: int) -> models.GraspDetail:
+    def get(self, shard_id: str, row: int) -> models.GraspDetail:
         grasp, shard = self._index.grasps.get(shard_id, row, scope=project_scope()), self._index.shards.get(shard_id)
         file = self._shard(shard.key, shard.sha256)
         names = file.attributes.get("joint_names")
@@ -84,20 +84,20 @@ class Grasps:
             hand_digest=shard.hand_digest,
             object_digest=shard.object_digest,
             joint_names=names if isinstance(names, list) else [],
-            postures={name: _posture(file, name, row) for name in _POSTURES},
-            thresholds_m=_numbers(file["quality/thresholds_m"]),
+            postures={name: _read_posture(file, name, row) for name in _POSTURES},
+            thresholds_m=_finite_list(file["quality/thresholds_m"]),
             sweep={
-                metric.name: _numbers(file[metric.path][row])
+                metric.name: _finite_list(file[metric.path][row])
                 for metric in GRASP_METRICS
                 if metric.swept and metric.path in file.arrays
             },
-            way=_trajectory(file, row),
-            scene=_scene(file, row),
-            pushes=_pushes(file, row),
-            verdict_margin=_value(file, "quality/verdict_margin", row),
+            way=_read_waypoints(file, row),
+            scene=_read_scene(file, row),
+            pushes=_read_pushes(file, row),
+            verdict_margin=_optional_float(file, "quality/verdict_margin", row),
             validated_by=validated_by(file, row),
-            recheck=_verdict(file, "quality/recheck", row),
-            friction=_number(file.attributes.get("mu")),
+            recheck=_optional_flag(file, "quality/recheck", row),
+            friction=_finite_or_none(file.attributes.get("mu")),
         )
 
     def _read_shard(self, key: str, sha256: str) -> Shard:
@@ -140,7 +140,7 @@ def _diversity(kinds: GraspKinds) -> models.Diversity | None:
     )
 
 
-def _bounds(query: models.GraspQuery, end: Literal["min", "max"]) -> dict[Metric, float]:
+def _metric_bounds(query: models.GraspQuery, end: Literal["min", "max"]) -> dict[Metric, float]:
     values = {metric: getattr(query, f"{end}_{metric}", None) for metric in MEAN_METRICS}
     found = {metric: value for metric, value in values.items() if value is not None}
     return found if query.type is None else {"grasp_type": float(GraspType[query.type.upper()])} | found
@@ -152,7 +152,7 @@ _LIFT: Final = "quality/lift_outcome"
 _DIRECTIONS: Final = ("+x", "−x", "+y", "−y", "+z", "−z")
 
 
-def _posture(file: Shard, name: str, row: int) -> models.Posture:
+def _read_posture(file: Shard, name: str, row: int) -> models.Posture:
     pose, joints = file[f"{name}/hand_pose"][row], file[f"{name}/joint_positions"][row]
     return models.Posture(hand_pose=pose.tolist(), joint_positions=joints.tolist())
 
@@ -165,9 +165,9 @@ def validated_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | No
     return "mujoco_warp" if validated is not None and validated[row] == 1 else "mujoco"
 
 
-def _pushes(file: Shard, row: int) -> list[models.Push]:
+def _read_pushes(file: Shard, row: int) -> list[models.Push]:
     outcomes = file.arrays.get(_OUTCOME)
-    if outcomes is None or _verdict(file, "quality/success", row) is None:
+    if outcomes is None or _optional_flag(file, "quality/success", row) is None:
         return []
     return [
         models.Push(direction=direction, outcome=PUSH_OUTCOMES.get(code, "unknown"))
@@ -175,25 +175,25 @@ def _pushes(file: Shard, row: int) -> list[models.Push]:
     ]
 
 
-def _verdict(file: Shard, path: str, row: int) -> bool | None:
+def _optional_flag(file: Shard, path: str, row: int) -> bool | None:
     column = file.arrays.get(path)
     return None if column is None or column[row] < 0 else bool(column[row])
 
 
-def _value(file: Shard, path: str, row: int) -> float | None:
+def _optional_float(file: Shard, path: str, row: int) -> float | None:
     column = file.arrays.get(path)
-    return None if column is None else _number(column[row])
+    return None if column is None else _finite_or_none(column[row])
 
 
-def _numbers(values: Any) -> list[Any]:
-    return [_number(value) for value in values.tolist()]
+def _finite_list(values: Any) -> list[Any]:
+    return [_finite_or_none(value) for value in values.tolist()]
 
 
-def _number(value: Any) -> float | None:
+def _finite_or_none(value: Any) -> float | None:
     return None if value is None or not math.isfinite(float(value)) else float(value)
 
 
-def _trajectory(file: Shard, row: int) -> list[models.Waypoint]:
+def _read_waypoints(file: Shard, row: int) -> list[models.Waypoint]:
     points = trajectory_of(file, row)
     return [
         models.Waypoint(
@@ -207,7 +207,7 @@ def _trajectory(file: Shard, row: int) -> list[models.Waypoint]:
     ]
 
 
-def _scene(file: Shard, row: int) -> models.GraspScene | None:
+def _read_scene(file: Shard, row: int) -> models.GraspScene | None:
     """Return the scene of a grasp; None if it was planned around a free object."""
     spec = scene_spec_of(file)
     if spec is None or spec.kind == "free" or "grasp/scene_index" not in file.arrays:
@@ -218,15 +218,15 @@ def _scene(file: Shard, row: int) -> models.GraspScene | None:
         kind=spec.kind,
         number=number,
         object_pose=file["scene/object_pose"][number].tolist(),
-        supports=list(supports_in(spec)),
-        neighbours=_neighbours(file, number),
-        clearance_m=_value(file, "quality/clearance_m", row),
+        supports=list(scene_supports(spec)),
+        neighbours=_read_neighbours(file, number),
+        clearance_m=_optional_float(file, "quality/clearance_m", row),
         lift=LIFT_OUTCOMES.get(tried, "unknown") if tried else None,
-        lift_hard=_verdict(file, "quality/lift_hard", row),
+        lift_hard=_optional_flag(file, "quality/lift_hard", row),
     )
 
 
-def _neighbours(file: Shard, number: int) -> list[models.Neighbour]:
+def _read_neighbours(file: Shard, number: int) -> list[models.Neighbour]:
     if "scene/neighbour_pose" not in file.arrays:
         return []
     names, digests = (file.attributes.get(key) for key in ("neighbours", "neighbour_digests"))

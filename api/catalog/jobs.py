@@ -47,14 +47,14 @@ class Shards:
         cursor: str | None = None,
     ) -> Page[Shard]:
         page = self._services.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor, scope=project_scope())
-        return Page[Shard](items=[_shard(shard) for shard in page.items], next=page.next)
+        return Page[Shard](items=[_shard_model(shard) for shard in page.items], next=page.next)
 
-    def one(self, shard_id: str) -> Shard:
-        return _shard(self._services.index.shards.get(shard_id, scope=project_scope()))
+    def get(self, shard_id: str) -> Shard:
+        return _shard_model(self._services.index.shards.get(shard_id, scope=project_scope()))
 
     def get_intact(self, shard_id: str) -> Shard:
         """Return a shard, and check its file against its checksum if the file changed since the last check."""
-        shard = self.one(shard_id)
+        shard = self.get(shard_id)
         self._checked.check(shard.key, shard.sha256)
         return shard
 
@@ -76,7 +76,7 @@ class Shards:
         return self._services.index.shards.assets_of(ids)
 
 
-def _shard(shard: ShardView) -> Shard:
+def _shard_model(shard: ShardView) -> Shard:
     return Shard(**shard.model_dump(), file=f"/v1/shards/{shard.id}/file")
 
 
@@ -100,30 +100,30 @@ class Jobs:
         if idempotency_key is not None:
             bound = self._idempotency.claim(key.name if key else "", idempotency_key, request)
         with bound:
-            record = job_actions.prepare(self._services, request, owner=caller_id(), scope=project_scope())
+            record = job_actions.prepare_job(self._services, request, owner=caller_id(), scope=project_scope())
             with bind_subjects(job=record.id), self._quotas.claim(key, record.id, record.request.grasps) as claim:
                 job, is_new = job_actions.enter_job(self._services, record)
                 claim.counts = is_new
                 log.info("job submitted" if is_new else "job existed already")
         # An identical job may exist with a named fidelity; the response has the choice made for this request.
-        return self._detail(job).model_copy(update={"choice": record.choice or job.choice})
+        return self._job_detail(job).model_copy(update={"choice": record.choice or job.choice})
 
     def cancel(self, job_id: str) -> JobDetail:
-        self._owned(job_id)
+        self._get_owned(job_id)
         with bind_subjects(job=job_id):
             job = job_actions.cancel(self._services, job_id)
             log.info("job cancelled")
-        return self._detail(job)
+        return self._job_detail(job)
 
     def retry(self, job_id: str) -> JobDetail:
-        grasps = self._owned(job_id).request.grasps
+        grasps = self._get_owned(job_id).request.grasps
         with bind_subjects(job=job_id), self._quotas.claim(caller.get(), job_id, grasps, is_new=False):
             job = job_actions.retry(self._services, job_id)
             log.info("job retried")
-        return self._detail(job)
+        return self._job_detail(job)
 
     def delete(self, job_id: str) -> None:
-        self._owned(job_id)
+        self._get_owned(job_id)
         with bind_subjects(job=job_id):
             deletion.delete_job(self._services, job_id, owner=caller_id())
             log.info("job deleted")
@@ -141,26 +141,28 @@ class Jobs:
         page = self._services.index.jobs.page(
             state=state, hand=hand, object=object, prefix=prefix, limit=limit, cursor=cursor, scope=project_scope()
         )
-        return Page[Job](items=[self._job(job, ()) for job in page.items], next=page.next)
+        return Page[Job](items=[self._job_model(job, ()) for job in page.items], next=page.next)
 
-    def one(self, job_id: str) -> JobDetail:
-        return self._detail(self._services.index.jobs.get(job_id, scope=project_scope()))
+    def get(self, job_id: str) -> JobDetail:
+        return self._job_detail(self._services.index.jobs.get(job_id, scope=project_scope()))
 
     def get_progress(self, job_id: str) -> Job:
         """Return a job with only the progress of its stages, for event streams."""
-        return self._job(self._services.index.jobs.get(job_id, scope=project_scope()), self._running(job_id))
+        return self._job_model(
+            self._services.index.jobs.get(job_id, scope=project_scope()), self._reported_tasks(job_id)
+        )
 
-    def _owned(self, job_id: str) -> JobView:
+    def _get_owned(self, job_id: str) -> JobView:
         job = self._services.index.jobs.get(job_id, scope=project_scope())
         require_ownership(job.owner, f"job {job_id}", job.project)
         return job
 
-    def _detail(self, job: JobView) -> JobDetail:
+    def _job_detail(self, job: JobView) -> JobDetail:
         histograms, diversity = self._grasps.statistics(job)
         mean = {data.metric: data.mean for data in histograms}
         shards = self._shards.page(job=job.id, limit=_PAGE).items
         return JobDetail(
-            **self._job(job, self._running(job.id)).model_dump(),
+            **self._job_model(job, self._reported_tasks(job.id)).model_dump(),
             **{name: getattr(job, name) for name in _DETAILS},
             attempts=self._services.index.jobs.attempts(job=job.id, limit=50),
             mean=MeanMetrics(**{metric: mean.get(metric) for metric in MEAN_METRICS}),
@@ -168,13 +170,14 @@ class Jobs:
             shards=sorted(shards, key=lambda shard: (shard.batch, _ORDER[shard.stage])),
         )
 
-    def _job(self, job: JobView, running: Sequence[TaskView]) -> Job:
+    def _job_model(self, job: JobView, running: Sequence[TaskView]) -> Job:
         request = job.request
         stages = stage_statuses(job, running, self._paces)
         tasks = sum(stage.tasks for stage in job.stages)
         return Job(
             **{name: getattr(job, name) for name in _SHARED},
-            **{name: getattr(request, name) for name in ("hand", "object", "method", "standing")},
+            **{name: getattr(request, name) for name in ("hand", "object", "method")},
+            standing=request.displayed_status,
             fidelity=request.fidelity if isinstance(request.fidelity, str) else request.fidelity.name,
             requested=request.grasps,
             progress=min(1.0, sum(stage.done for stage in job.stages) / tasks) if tasks else 0.0,
@@ -183,7 +186,7 @@ class Jobs:
             stages=stages,
         )
 
-    def _running(self, job_id: str) -> list[TaskView]:
+    def _reported_tasks(self, job_id: str) -> list[TaskView]:
         """Return running tasks, then those of the first waiting tasks that have a reason to wait."""
         tasks = self._services.index.jobs.tasks
         running = tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items
@@ -206,7 +209,7 @@ class TaskRates:
         self._first: OrderedDict[tuple[str, int], tuple[float, float]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def of(self, task: TaskView) -> float | None:
+    def rate_of(self, task: TaskView) -> float | None:
         """Return the share of the task done per second; None while unknown."""
         share = task.done / task.total if task.total else 0.0
         now = self._clock()
@@ -221,7 +224,7 @@ class TaskRates:
 
 def stage_statuses(job: JobView, tasks: Sequence[TaskView], paces: TaskRates) -> list[StageStatus]:
     """Return the stages of a job; `tasks` are its running tasks, and waiting ones with a reason to wait."""
-    return [_status(stage, [task for task in tasks if task.stage is stage.stage], paces) for stage in job.stages]
+    return [_stage_status(stage, [task for task in tasks if task.stage is stage.stage], paces) for stage in job.stages]
 
 
 def eta_of_job(job: JobView, stages: Sequence[StageStatus]) -> float | None:
@@ -234,10 +237,10 @@ def eta_of_job(job: JobView, stages: Sequence[StageStatus]) -> float | None:
     return sum(stage.eta_s or 0.0 for stage in remaining)
 
 
-def _status(stage: StageProgress, tasks: list[TaskView], paces: TaskRates) -> StageStatus:
+def _stage_status(stage: StageProgress, tasks: list[TaskView], paces: TaskRates) -> StageStatus:
     state = stage_state(stage)
     running = [task for task in tasks if task.state is State.RUNNING]
-    rate = None if state.is_final else _rate(stage, running, paces)
+    rate = None if state.is_final else _stage_rate(stage, running, paces)
     left = max(0.0, stage.tasks - stage.done)
     return StageStatus(
         **stage.model_dump(),
@@ -249,9 +252,9 @@ def _status(stage: StageProgress, tasks: list[TaskView], paces: TaskRates) -> St
     )
 
 
-def _rate(stage: StageProgress, running: list[TaskView], paces: TaskRates) -> float | None:
+def _stage_rate(stage: StageProgress, running: list[TaskView], paces: TaskRates) -> float | None:
     """Return tasks per second of the running tasks; if unknown, the mean rate of the finished tasks."""
-    known = [pace for task in running if (pace := paces.of(task)) is not None]
+    known = [pace for task in running if (pace := paces.rate_of(task)) is not None]
     if known:
         return sum(known) * len(running) / len(known)
     if stage.succeeded > stage.reused and stage.seconds > 0:

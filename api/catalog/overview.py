@@ -17,10 +17,10 @@ from pydantic import Field
 from graspd.api.access.auth import caller, project_scope, require_ownership
 from graspd.api.access.keys import KeyFile, ProjectLimits
 from graspd.api.catalog.jobs import Jobs
-from graspd.api.metrics import Snapshot
+from graspd.api.metrics import MetricsSnapshot
 from graspd.api.models import Health, Part, Worker
 from graspd.service.index.notes import Damage
-from graspd.service.index.queries.overview import read_index
+from graspd.service.index.queries.overview import read_index_status
 from graspd.service.index.views import FailureGroup, Stats, TaskView, UsageDay, View
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import (
@@ -38,7 +38,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import check_service
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.port import QueueStatus
-from graspd.service.store.records import Deletion, What, deletions
+from graspd.service.store.records import Deletion, What, restorable_deletions
 
 log = logging.getLogger(__name__)
 _DAMAGE_SHOWN: Final = 5
@@ -111,8 +111,8 @@ class Overview:
             return 0, []
         return self._services.index.damage.summary(limit=_DAMAGE_SHOWN)
 
-    def snapshot(self) -> Snapshot:
-        found = Snapshot()
+    def metrics_snapshot(self) -> MetricsSnapshot:
+        found = MetricsSnapshot()
         latencies = {name: part.latency_ms for name, part in self.health().parts.items()}
         found.add_parts({name: None if ms is None else ms / 1000 for name, ms in latencies.items()})
         with contextlib.suppress(UnavailableError):
@@ -120,7 +120,7 @@ class Overview:
             found.add_queue(self._queue_status(), is_kept=queue.is_announced(PART))
             found.add_sums(queue.counter_sums())
         with contextlib.suppress(UnavailableError):
-            found.add_index(read_index(self._services.index.database))
+            found.add_index(read_index_status(self._services.index.database))
         return found
 
     def fingerprint(self) -> str:
@@ -140,7 +140,7 @@ class Overview:
     def _tasks_in_scope(self, tasks: Iterable[str]) -> set[str]:
         """Return the tasks that are in scope or belong to no job, such as checks of uploads."""
         wanted, scope = set(tasks), project_scope()
-        return wanted if scope.everything else wanted - self._services.index.jobs.out_of_scope(wanted, scope)
+        return wanted if scope.everything else wanted - self._services.index.jobs.tasks_out_of_scope(wanted, scope)
 
     def _queue_status(self) -> QueueStatus:
         # A worker's registration expires in whole seconds: see `worker.process.heartbeat`.
@@ -172,7 +172,7 @@ class Probes:
             return self._known[1]
 
     def _probe_all(self) -> Health:
-        questions = {"redis": self._redis, "index": self._index, "store": self._store}
+        questions = {"redis": self._probe_redis, "index": self._probe_index, "store": self._probe_store}
         probes = {name: self._hanging.get(name) or _Probe(name, question) for name, question in questions.items()}
         deadline = time.monotonic() + PATIENCE_S
         parts = {name: probe.part(deadline) for name, probe in probes.items()}
@@ -180,9 +180,9 @@ class Probes:
         controller, workers = self._controller_and_workers() if parts["redis"].ok else (False, 0)
         return Health(ok=all(part.ok for part in parts.values()), parts=parts, controller=controller, workers=workers)
 
-    def _redis(self) -> Part:
+    def _probe_redis(self) -> Part:
         """Probe Redis; a Redis of another service is not ready."""
-        part, service = _healthy_part(self._services.queue.ping()), self._services.queue.service()
+        part, service = _healthy_part(self._services.queue.ping()), self._services.queue.service_id()
         if service != self._service:
             try:
                 check_service(self._services.store, service)
@@ -193,7 +193,7 @@ class Probes:
             self._service = service
         return part
 
-    def _index(self) -> Part:
+    def _probe_index(self) -> Part:
         """Probe the index; an incomplete index is not ready."""
         part, made = _healthy_part(self._services.index.database.ping()), self._services.index.notes.completeness()
         if made is None:
@@ -203,7 +203,7 @@ class Probes:
             return part.model_copy(update={"detail": f"{detail}; run `graspd admin store verify`"})
         return part
 
-    def _store(self) -> Part:
+    def _probe_store(self) -> Part:
         return _healthy_part(self._services.store.probe())
 
     def _controller_and_workers(self) -> tuple[bool, int]:
@@ -265,7 +265,7 @@ class Usage:
         return {name: limits for name, limits in self._keys.projects().items() if project_scope().can_see(name)}
 
 
-def as_csv(days: list[UsageDay]) -> str:
+def usage_csv(days: list[UsageDay]) -> str:
     text = io.StringIO()
     table = csv.writer(text)
     table.writerow(_COLUMNS)
@@ -291,8 +291,8 @@ class Deletions:
     def __init__(self, services: Services) -> None:
         self._services = services
 
-    def recent(self) -> list[DeletionView]:
-        return [self._view(one) for one in deletions(self._services.store) if _is_in_scope(one)]
+    def list_restorable(self) -> list[DeletionView]:
+        return [self._view(one) for one in restorable_deletions(self._services.store) if _is_in_scope(one)]
 
     def restore(self, what: What, name: str) -> DeletionView:
         def permit(one: Deletion) -> None:

@@ -26,7 +26,7 @@ from graspd.service.model.records import MOST_TAGS, Grasp, Tag, rows_by_shard, t
 from graspd.service.pipeline import tagging
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.integrity import read_checked
-from graspd.service.store.shards import part_of_shard, read_shard, relative_path_of
+from graspd.service.store.shards import read_shard, relative_path_of, shard_bytes_of_rows
 
 log = logging.getLogger(__name__)
 
@@ -41,18 +41,18 @@ class Tags:
     def all(self) -> list[TagView]:
         return self._services.index.tags.all(scope=project_scope())
 
-    def one(self, name: str) -> TagView:
+    def get(self, name: str) -> TagView:
         wanted = self._services.index.tags.id_of(name, scope=project_scope())
         return next(tag for tag in self.all() if tag.id == wanted)
 
-    def of(self, grasps: Collection[Grasp]) -> dict[Grasp, list[str]]:
+    def names_by_grasp(self, grasps: Collection[Grasp]) -> dict[Grasp, list[str]]:
         """Return the names of the tags of the given grasps; grasps without tags are omitted."""
-        return self._services.index.tags.of(grasps, scope=project_scope())
+        return self._services.index.tags.names_by_grasp(grasps, scope=project_scope())
 
-    def chosen(self, selection: Selection) -> list[Grasp]:
+    def resolve_selection(self, selection: Selection) -> list[Grasp]:
         """Return the grasps of a selection, each once; raise NotFoundError if one is out of scope."""
         if selection.filter is not None:
-            return self._grasps.members(selection.filter)
+            return self._grasps.matching_grasps(selection.filter)
         named = sorted({(grasp.shard_id, grasp.row) for grasp in selection.grasps or ()})
         there = self._services.index.tags.existing_grasps(named, scope=project_scope())
         for shard, row in named:
@@ -60,28 +60,30 @@ class Tags:
                 raise NotFoundError(f"there is no grasp {row} in shard {shard!r}")
         return named
 
-    def give(self, name: str, selection: Selection) -> TagChange:
-        if not (grasps := self.chosen(selection)):
+    def tag_grasps(self, name: str, selection: Selection) -> TagChange:
+        if not (grasps := self.resolve_selection(selection)):
             raise InputError("no grasp passes this filter, so none gets the tag")
         project = project_scope().project
 
         def permit(tag: Tag | None) -> None:
-            _permit(tag)
+            _require_tag_ownership(tag)
             if tag is None and self._tag_count(project) >= MOST_TAGS:
                 raise LimitError(f"there are {MOST_TAGS} tags already, the maximum; delete one")
 
         changed = tagging.tag_grasps(self._services, name, grasps, project=project, owner=caller_id(), permit=permit)
         log.info("tag %s given to %d grasps", name, changed)
-        return TagChange(tag=self.one(tag_id(name, project)), changed=changed)
+        return TagChange(tag=self.get(tag_id(name, project)), changed=changed)
 
-    def untag(self, name: str, selection: Selection) -> TagChange:
+    def untag_grasps(self, name: str, selection: Selection) -> TagChange:
         tag = self._services.index.tags.id_of(name, scope=project_scope())
-        changed = tagging.untag_grasps(self._services, tag, self.chosen(selection), permit=_permit)
-        return TagChange(tag=self.one(tag), changed=changed)
+        changed = tagging.untag_grasps(
+            self._services, tag, self.resolve_selection(selection), permit=_require_tag_ownership
+        )
+        return TagChange(tag=self.get(tag), changed=changed)
 
-    def remove(self, name: str) -> None:
+    def delete(self, name: str) -> None:
         tag = self._services.index.tags.id_of(name, scope=project_scope())
-        tagging.delete_tag(self._services, tag, permit=_permit, owner=caller_id())
+        tagging.delete_tag(self._services, tag, permit=_require_tag_ownership, owner=caller_id())
         log.info("tag %s removed", name)
 
     def _tag_count(self, project: str) -> int:
@@ -90,7 +92,7 @@ class Tags:
         return sum(bool(project) or may_change(tag.owner, tag.project) for tag in found)
 
 
-def _permit(tag: Tag | None) -> None:
+def _require_tag_ownership(tag: Tag | None) -> None:
     if tag is not None:
         require_ownership(tag.owner, f"the tag {tag.name!r}", tag.project)
 
@@ -115,7 +117,7 @@ class GraspExports:
         """Write grasps that are in scope, and their selection `said`, to a file; return its size and bytes."""
         file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
         try:
-            {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)
+            {"csv": self._write_csv, "json": self._write_json, "zip": self._write_zip}[format](file, places, said)
             size = file.tell()
             file.seek(0)
         except BaseException:
@@ -123,25 +125,25 @@ class GraspExports:
             raise
         return size, _stream(file)
 
-    def _rows(self, places: Sequence[Grasp]) -> Iterator[dict[str, Any]]:
-        tags = self._tags.of(places)
+    def _export_rows(self, places: Sequence[Grasp]) -> Iterator[dict[str, Any]]:
+        tags = self._tags.names_by_grasp(places)
         for grasp in self._grasps.get_many(places):
             yield grasp.model_dump(mode="json") | {"tags": tags.get((grasp.shard_id, grasp.row), [])}
 
-    def _csv(self, file: IO[bytes], places: Sequence[Grasp], _: Mapping[str, Any]) -> None:
+    def _write_csv(self, file: IO[bytes], places: Sequence[Grasp], _: Mapping[str, Any]) -> None:
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
         rows = csv.DictWriter(text, _COLUMNS)
         rows.writeheader()
-        rows.writerows(row | {"tags": " ".join(row["tags"])} for row in self._rows(places))
+        rows.writerows(row | {"tags": " ".join(row["tags"])} for row in self._export_rows(places))
         text.detach()
 
-    def _json(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
+    def _write_json(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
         file.write(b'{"chosen": ' + json.dumps(said).encode() + b', "items": [')
-        for number, row in enumerate(self._rows(places)):
+        for number, row in enumerate(self._export_rows(places)):
             file.write((b",\n" if number else b"\n") + json.dumps(row).encode())
         file.write(b"\n]}\n")
 
-    def _zip(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
+    def _write_zip(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
         shards = rows_by_shard(places)
         if not shards:
             raise InputError("the selection contains no grasp; change it")
@@ -159,7 +161,7 @@ class GraspExports:
                 looked_at += len(mask)
                 names.append(relative_path_of(shard, names))
                 # ZipInfo has a fixed date, so that the same grasps give an identical file.
-                packed.writestr(zipfile.ZipInfo(str(names[-1])), part_of_shard(shard, mask))
+                packed.writestr(zipfile.ZipInfo(str(names[-1])), shard_bytes_of_rows(shard, mask))
             facts = {**said, "looked_at": looked_at, "kept": len(set(places)), "shards": [*map(str, names)]}
             packed.writestr(zipfile.ZipInfo("subset.json"), json.dumps(facts, indent=1) + "\n")
 

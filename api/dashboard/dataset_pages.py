@@ -48,7 +48,7 @@ def datasets_page(
     assets: AssetsOf,
     cursor: Annotated[str | None, Query(max_length=512)] = None,
 ) -> HTMLResponse:
-    return _overview(request, datasets, assets, cursor=cursor)
+    return _render_datasets(request, datasets, assets, cursor=cursor)
 
 
 @router.post("", dependencies=SUBMIT, response_model=None)
@@ -59,7 +59,7 @@ def create(request: Request, datasets: DatasetsOf, assets: AssetsOf, fields: Fie
     try:
         dataset = datasets.create(DatasetRequest.model_validate(wanted | {"neighbours": neighbours}))
     except (ValidationError, InputError) as error:
-        return _overview(request, datasets, assets, problem=first_message(error), form=wanted, status=422)
+        return _render_datasets(request, datasets, assets, problem=first_message(error), form=wanted, status=422)
     return RedirectResponse(f"/datasets/{dataset.name}", status_code=303)
 
 
@@ -77,7 +77,7 @@ def act_on_pairs(
         else:
             done, left = _apply_to_each(_job_action(jobs, action), _jobs_of(jobs, pairs, action))
     except (ValidationError, InputError) as error:
-        return _overview(request, datasets, assets, problem=first_message(error), status=422)
+        return _render_datasets(request, datasets, assets, problem=first_message(error), status=422)
     return _redirect("/datasets", action, done=done, left=left)
 
 
@@ -89,7 +89,7 @@ def dataset_page(
     state: str = "",
     cursor: Annotated[str | None, Query(max_length=512)] = None,
 ) -> HTMLResponse:
-    dataset = datasets.one(name)
+    dataset = datasets.get(name)
     chosen = State(state) if state in set(State) else None
     as_matrix = dataset.cells <= MATRIX_CELLS and chosen is None
     page = None if as_matrix else datasets.cells(name, state=chosen, limit=_CELLS_AT_ONCE, cursor=cursor)
@@ -172,7 +172,7 @@ def _action_summary(request: Request) -> str:
     return f"{done} {what} {_DONE[given['did']]}{unchanged}."
 
 
-def _overview(
+def _render_datasets(
     request: Request,
     datasets: Datasets,
     assets: Assets,

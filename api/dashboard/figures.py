@@ -56,7 +56,7 @@ def minute_plot(values: Sequence[int], start: float) -> Plot:
     return Plot(f"Valid grasps per minute in the last hour; maximum {max(values, default=0)}", points, json.dumps(data))
 
 
-def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
+def histogram_bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
     """Return a histogram's bars, each with a link to its grasps.
     The link leads to page `path` with the grasps in the bar's range that match `where`."""
     width, top = (histogram.high - histogram.low) / len(histogram.counts), max(histogram.counts) or 1
@@ -139,13 +139,13 @@ def dataset_grid(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
             value=cell.job_id,
             href=f"/jobs/{cell.job_id}" if cell.planned else "",
             state=cell.state.value,
-            made=cell.counted(dataset.options),
+            made=cell.counted_grasps(dataset.options),
             candidates=cell.candidates,
             share=cell.valid_yield,
-            standing=dataset.options.standing,
+            standing=dataset.options.displayed_status,
             progress=cell.progress if cell.state is State.RUNNING else None,
             note=cell.reason or "",
-            scene=dataset.options.place.kind,
+            scene=dataset.options.scene_spec.kind,
         )
         for cell in cells
     }
@@ -235,7 +235,7 @@ def load_stability(store: Store) -> studies.Stability | None:
     """Load the newest published stability maps; None if there are none, or they are unreadable."""
     try:
         found = latest_record(store, STABILITY)
-        return None if found is None else studies.from_json(found)
+        return None if found is None else studies.parse_stability(found)
     except (ValueError, DamagedError):
         return None
 
@@ -245,14 +245,16 @@ def draw_map(one: studies.StabilityMap) -> MapDrawing:
         map=one,
         panels=[_panel(one, name) for name in one.panels],
         counts={outcome: number for outcome, number in studies.count_outcomes(one.cells).items() if number},
-        reached=_shares(one.reached()),
+        reached=_outcome_shares(one.reached()),
     )
 
 
 def _panel(one: studies.StabilityMap, name: str) -> Panel:
-    cells = one.of(name)
+    cells = one.panel_cells(name)
     xs, ys = ([*dict.fromkeys(getattr(cell, axis) for cell in cells)] for axis in ("x", "y"))
-    squares = {(cell.x, cell.y): _square(one, cell, ringed=one.is_divided and cell.reached) for cell in cells}
+    squares = {
+        (cell.x, cell.y): _cell_square(one, cell, ringed=one.is_partly_reachable and cell.reached) for cell in cells
+    }
     line = one.lines.get(name, [])
     if any(isinstance(x, str) for x in xs):
         # Texts are labels of rows, because columns are narrow.
@@ -267,7 +269,7 @@ def _panel(one: studies.StabilityMap, name: str) -> Panel:
     return Panel(name, one.x, one.y, [studies.format_tick(x) for x in xs], rows, points)
 
 
-def _square(one: studies.StabilityMap, cell: studies.MapCell, *, ringed: bool) -> CellSquare:
+def _cell_square(one: studies.StabilityMap, cell: studies.MapCell, *, ringed: bool) -> CellSquare:
     value = cell.note or (f"{cell.value:.3g}" if cell.value == cell.value else "no value")
     return CellSquare(
         outcome=cell.outcome,
@@ -277,7 +279,7 @@ def _square(one: studies.StabilityMap, cell: studies.MapCell, *, ringed: bool) -
     )
 
 
-def _shares(cells: Sequence[studies.MapCell]) -> list[Share]:
+def _outcome_shares(cells: Sequence[studies.MapCell]) -> list[Share]:
     found = studies.count_outcomes(cells)
     shares, x = [], 0.0
     for outcome in studies.OUTCOMES:

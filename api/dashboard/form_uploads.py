@@ -21,7 +21,7 @@ from graspd.service.index.views import AssetView
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.assets import asset_json
-from graspd.service.store.descriptions import json_object
+from graspd.service.store.descriptions import parse_json_object
 
 _CHECK_WAIT_S: Final = 15.0
 UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))
@@ -69,22 +69,22 @@ class AssetChoice:
     held: str = ""
     """Digest of the refused file in the store; if empty, the user must choose the file again."""
 
-    def place(self, kind: AssetKind) -> str:
+    def form_field(self, kind: AssetKind) -> str:
         return FILE_FIELDS[kind] if self.file else kind.value
 
 
 def choose_asset(request: Request, assets: Assets, fields: FormData, kind: AssetKind) -> AssetChoice:
     """Return the hand or object of a submitted form: an uploaded file, a known asset, or the refused file."""
-    file, known = fields.get(FILE_FIELDS[kind]), _text(fields, kind.value)
+    file, known = fields.get(FILE_FIELDS[kind]), _field_text(fields, kind.value)
     if isinstance(file, UploadFile) and file.filename:
         try:
-            asset = _store(request, assets, kind, file, _units(fields))
+            asset = _store_upload(request, assets, kind, file, _chosen_unit(fields))
         except InputError as error:
             return AssetChoice(refused=Refusal(str(error)), file=file.filename)
         return _wait_for_check(assets, asset)
     if known:
         return AssetChoice(name=known)
-    if held := _text(fields, f"{kind.value}_held"):
+    if held := _field_text(fields, f"{kind.value}_held"):
         try:
             return _wait_for_check(assets, _retry_upload(assets, kind, held, fields))
         except InputError as error:
@@ -98,14 +98,14 @@ def refusal_of(asset: AssetView) -> Refusal:
     lengths = facts.get("lengths_m")
     units = [
         Fix(json.dumps({"units": unit}), f"Read in {words}" + _length(lengths, unit))
-        for unit in _entries(facts, "units_suggested")
+        for unit in _list_entries(facts, "units_suggested")
         if isinstance(unit, str) and (words := dict(UNITS).get(unit))
     ]
-    others = [fix for one in _entries(facts, "options_suggested") if isinstance(one, dict) and (fix := _fix(one))]
+    others = [fix for one in _list_entries(facts, "options_suggested") if isinstance(one, dict) and (fix := _fix(one))]
     return Refusal(str(facts.get("problem") or asset.message or "refused"), (*units, *others))
 
 
-def _entries(facts: Mapping[str, Any], key: str) -> list[Any]:
+def _list_entries(facts: Mapping[str, Any], key: str) -> list[Any]:
     found = facts.get(key)
     return found if isinstance(found, list) else []
 
@@ -132,7 +132,7 @@ def _fix(options: dict[str, Any]) -> Fix | None:
     return Fix(json.dumps(options), words)
 
 
-def _store(request: Request, assets: Assets, kind: AssetKind, file: UploadFile, units: str) -> AssetView:
+def _store_upload(request: Request, assets: Assets, kind: AssetKind, file: UploadFile, units: str) -> AssetView:
     options = json.dumps({"units": units}) if kind is AssetKind.OBJECT and units != "m" else ""
     limit = request.app.state.settings.max_upload_bytes
     return store_upload(assets, kind, file, None, limit_bytes=limit, options=options, rename=True)
@@ -140,13 +140,13 @@ def _store(request: Request, assets: Assets, kind: AssetKind, file: UploadFile, 
 
 def _retry_upload(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
     """Store the refused file again, with the options of the pressed button or with changed units."""
-    before, said = assets.one(kind, digest), fix_options(fields, kind)
-    if not said and kind is AssetKind.OBJECT and (units := _units(fields)) != _text(fields, "held_units"):
+    before, said = assets.get(kind, digest), fix_options(fields, kind)
+    if not said and kind is AssetKind.OBJECT and (units := _chosen_unit(fields)) != _field_text(fields, "held_units"):
         said = {"units": units}
     if not said:
         return before
     files = assets.files(before)
-    stated = json_object(asset_json(files), "asset.json")
+    stated = parse_json_object(asset_json(files), "asset.json")
     for key, value in said.items():
         known = stated.get(key)
         stated[key] = {**known, **value} if isinstance(known, dict) and isinstance(value, dict) else value
@@ -155,9 +155,9 @@ def _retry_upload(assets: Assets, kind: AssetKind, digest: str, fields: FormData
 
 def fix_options(fields: FormData, kind: AssetKind) -> dict[str, Any]:
     """Return the options of the pressed button, with the value of its field in place of null."""
-    said = json_object(text, "the option") if (text := _text(fields, f"{kind.value}_fix")) else {}
+    said = parse_json_object(text, "the option") if (text := _field_text(fields, f"{kind.value}_fix")) else {}
     for key in [key for key, value in said.items() if value is None and key in _ASKED]:
-        label, given = _ASKED[key][0], _text(fields, f"{kind.value}_{key}").strip()
+        label, given = _ASKED[key][0], _field_text(fields, f"{kind.value}_{key}").strip()
         if not given:
             raise InputError(f"{label}: a value is missing")
         try:
@@ -172,13 +172,13 @@ def _wait_for_check(assets: Assets, asset: AssetView) -> AssetChoice:
     deadline = time.monotonic() + _CHECK_WAIT_S
     while asset.verdict is None and time.monotonic() < deadline:
         time.sleep(0.2)
-        asset = assets.one(asset.kind, asset.digest)
+        asset = assets.get(asset.kind, asset.digest)
     if asset.verdict == "refuse":
         return AssetChoice(refused=refusal_of(asset), file=asset.name, held=asset.digest)
     return AssetChoice(name=asset.name)
 
 
-def choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> list[tuple[str, str]]:
+def select_choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> list[tuple[str, str]]:
     """Return names with their labels, including the name or the refused file that the form shows."""
     known = asset_choices(assets, kind)
     if one.refused:
@@ -198,10 +198,10 @@ def asset_choices(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
     return [(name, name if one.builtin or one.verdict else f"{name} (being checked)") for name, one in newest]
 
 
-def _text(fields: FormData, name: str) -> str:
+def _field_text(fields: FormData, name: str) -> str:
     return value if isinstance(value := fields.get(name), str) else ""
 
 
-def _units(fields: FormData) -> str:
-    units = _text(fields, "units")
+def _chosen_unit(fields: FormData) -> str:
+    units = _field_text(fields, "units")
     return units if units in dict(UNITS) else "m"

@@ -19,7 +19,7 @@ from starlette.datastructures import FormData, UploadFile
 from graspd.api.access.auth import project_scope
 from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.jobs import Jobs
-from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, AssetChoice, choices, choose_asset, refusal_of
+from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, AssetChoice, choose_asset, refusal_of, select_choices
 from graspd.api.dashboard.rendering import render
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, JobsOf
 from graspd.service.index.index import Index
@@ -28,7 +28,7 @@ from graspd.service.model.base import first_error, problem_text
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.fidelity import OFFERED
-from graspd.service.model.options import Form, Row, rows
+from graspd.service.model.options import FormField, OptionRow, option_rows
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.datasets.cost import estimate
@@ -40,11 +40,11 @@ router = APIRouter(include_in_schema=False)
 def fields_of(most: int) -> Any:
     """Return a dependency that reads a form of at most `most` fields."""
 
-    async def fields(request: Request) -> AsyncIterator[FormData]:
+    async def parse_fields(request: Request) -> AsyncIterator[FormData]:
         async with request.form(max_fields=most) as found:
             yield found
 
-    return Depends(fields)
+    return Depends(parse_fields)
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class FormInput:
     attributes: Mapping[str, Any]
 
     @classmethod
-    def of(cls, row: Row, form: Form) -> FormInput:
+    def from_row(cls, row: OptionRow, form: FormField) -> FormInput:
         kind = "checkbox" if row.kind is bool else "select" if form.choices else "text"
         limits: dict[str, Any] = {}
         if row.kind in (int, float):
@@ -77,8 +77,8 @@ class FormInput:
 def inputs_of(section: str = "", *, cells: bool = False) -> list[FormInput]:
     """Return the fields of a job's form, or of a dataset's with `cells`; an empty section means all."""
     return [
-        FormInput.of(row, form)
-        for row in rows(JobOptions, "job")
+        FormInput.from_row(row, form)
+        for row in option_rows(JobOptions, "job")
         if (form := row.form) and section in ("", form.section) and (form.cells or not cells)
     ]
 
@@ -89,12 +89,12 @@ DEFAULTS: Final = {"hand": "allegro", "object": "mug"} | {one.name: one.default 
 @router.get("/submit", dependencies=READ)
 def submit_page(request: Request, assets: AssetsOf) -> HTMLResponse:
     given = {key: value for key, value in request.query_params.items() if key in DEFAULTS}
-    return _form(request, assets, DEFAULTS | given)
+    return _render_form(request, assets, DEFAULTS | given)
 
 
 @router.get("/submit/refusals/{kind}/{digest}", dependencies=READ)
-def refused(request: Request, kind: AssetKind, digest: str, assets: AssetsOf) -> HTMLResponse:
-    found = refusal_of(assets.one(kind, digest))
+def refusal_page(request: Request, kind: AssetKind, digest: str, assets: AssetsOf) -> HTMLResponse:
+    found = refusal_of(assets.get(kind, digest))
     return render(request, "refusal.html", kind=kind.value, problem=found.problem, fixes=found.fixes)
 
 
@@ -131,26 +131,26 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
     things = {kind: choose_asset(request, assets, fields, kind) for kind in FILE_FIELDS}
     form |= {kind.value: one.name for kind, one in things.items()}
     shown = DEFAULTS | form | {"units": fields.get("units") or "m"}
-    refused = {one.place(kind): one.refused.problem for kind, one in things.items() if one.refused}
+    refused = {one.form_field(kind): one.refused.problem for kind, one in things.items() if one.refused}
     if any(fields.get(f"{kind.value}_fix") for kind in FILE_FIELDS):
         # The button of a fix only shows its result; the submit button submits.
-        return _form(request, assets, shown, things=things, errors=refused, status=422 if refused else 200)
+        return _render_form(request, assets, shown, things=things, errors=refused, status=422 if refused else 200)
     try:
         named = {kind.value: one.name or "unnamed" for kind, one in things.items()}
         body = JobRequest.model_validate(form | named | {"neighbours": split_list(str(form.get("neighbours", "")))})
     except ValidationError as error:
-        return _form(request, assets, shown, things=things, errors=refused | _by_field(error), status=422)
+        return _render_form(request, assets, shown, things=things, errors=refused | _errors_by_field(error), status=422)
     if refused:
-        return _form(request, assets, shown, things=things, errors=refused, status=422)
+        return _render_form(request, assets, shown, things=things, errors=refused, status=422)
     try:
         job = jobs.submit(body)
     except InputError as error:
         problem = {"title": error.title, "detail": str(error)}
-        return _form(request, assets, shown, things=things, problem=problem, status=error.status)
+        return _render_form(request, assets, shown, things=things, problem=problem, status=error.status)
     return RedirectResponse(f"/jobs/{job.id}", status_code=303)
 
 
-def _by_field(error: ValidationError) -> dict[str, str]:
+def _errors_by_field(error: ValidationError) -> dict[str, str]:
     errors: dict[str, str] = {}
     for entry in error.errors():
         said = problem_text(entry)
@@ -161,7 +161,7 @@ def _by_field(error: ValidationError) -> dict[str, str]:
     return errors
 
 
-def _form(
+def _render_form(
     request: Request,
     assets: Assets,
     form: dict[str, Any],
@@ -181,11 +181,11 @@ def _form(
         errors=dict.fromkeys([*DEFAULTS, "file", "hand_file"], "") | (errors or {}),
         problem=problem,
         sections={section: inputs_of(section) for section in ("grasps", "scenes")},
-        hands=choices(assets, AssetKind.HAND, str(form["hand"]), things[AssetKind.HAND]),
-        objects=choices(assets, AssetKind.OBJECT, str(form["object"]), things[AssetKind.OBJECT]),
+        hands=select_choices(assets, AssetKind.HAND, str(form["hand"]), things[AssetKind.HAND]),
+        objects=select_choices(assets, AssetKind.OBJECT, str(form["object"]), things[AssetKind.OBJECT]),
         held={kind.value: one.held for kind, one in things.items()},
         fixes={kind.value: one.refused.fixes if one.refused else () for kind, one in things.items()},
-        expected=request.app.state.expectations.of(form),
+        expected=request.app.state.expectations.by_fidelity(form),
         units=UNITS,
         max_upload=request.app.state.settings.max_upload_bytes,
     )
@@ -204,7 +204,7 @@ def split_list(text: str) -> list[str]:
     return text.replace(",", " ").split()
 
 
-class Expectations:
+class FormEstimates:
     """Estimates for the form of a job, with a cache of batch costs."""
 
     def __init__(self, index: Index) -> None:
@@ -212,14 +212,14 @@ class Expectations:
         self._read: dict[tuple[Stage, ProjectScope], tuple[float, list[BatchCost]]] = {}
         self._lock = threading.Lock()
 
-    def of(self, form: Mapping[str, Any]) -> list[tuple[str, str, Estimate | None]]:
+    def by_fidelity(self, form: Mapping[str, Any]) -> list[tuple[str, str, Estimate | None]]:
         """Return each offered fidelity, its description, and its estimate for a form; None if unknown."""
         wanted = {key: value for key, value in form.items() if key not in ("hand", "object") and value != ""}
         wanted["neighbours"] = split_list(str(form.get("neighbours", "")))
         wanted |= {"hands": (str(form["hand"]),), "objects": (str(form["object"]),)}
-        return [(name, WORDS[name], self._one(wanted | {"fidelity": name})) for name in OFFERED]
+        return [(name, WORDS[name], self._estimate(wanted | {"fidelity": name})) for name in OFFERED]
 
-    def _one(self, wanted: dict[str, Any]) -> Estimate | None:
+    def _estimate(self, wanted: dict[str, Any]) -> Estimate | None:
         try:
             return estimate(self._index, Matrix.model_validate(wanted), costs=self._costs, scope=project_scope())
         except (ValidationError, GraspdError):
@@ -229,5 +229,5 @@ class Expectations:
         with self._lock:
             now, key = time.monotonic(), (stage, project_scope())
             if key not in self._read or now - self._read[key][0] > KEPT_S:
-                self._read[key] = (now, self._index.costs.of_batches(stage, scope=project_scope()))
+                self._read[key] = (now, self._index.costs.batch_costs(stage, scope=project_scope()))
             return self._read[key][1]

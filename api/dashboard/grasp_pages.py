@@ -72,8 +72,8 @@ def grasps_page(
         here="/grasps",
         shown_tag=next((tag for tag in known if tag.name == query.tag), None),
         tag_choices=[(tag.name, tag.name) for tag in known],
-        hands=_names(assets, AssetKind.HAND),
-        objects=_names(assets, AssetKind.OBJECT),
+        hands=_asset_names(assets, AssetKind.HAND),
+        objects=_asset_names(assets, AssetKind.OBJECT),
         rows=rows,
         models=shards.assets_of({grasp.shard_id for grasp in rows}) if view == "cards" else {},
         columns=COLUMNS,
@@ -95,7 +95,7 @@ def grasps_page(
 def grasp_page(
     request: Request, shard_id: str, row: int, grasps: GraspsOf, shards: ShardsOf, tags: TagsOf
 ) -> HTMLResponse:
-    grasp, shard = grasps.one(shard_id, row), shards.one(shard_id)
+    grasp, shard = grasps.get(shard_id, row), shards.get(shard_id)
     return render(
         request,
         "grasp.html",
@@ -103,7 +103,7 @@ def grasp_page(
         grasp=grasp,
         did=action_summary(dict(request.query_params)),
         tags=[tag.name for tag in tags.all()],
-        tagged=tags.of([(shard_id, row)]),
+        tagged=tags.names_by_grasp([(shard_id, row)]),
         stops=[point.name for point in grasp.way if point.name],
         shard=shard,
         job=shards.job_of(shard_id),
@@ -115,18 +115,18 @@ def grasp_page(
         type=GraspType(int(grasp.grasp_type or 0)),
         weakest=_WEAKEST.get(grasp.robust_weakest or ""),
         swept=[metric for metric in GRASP_METRICS if metric.name in grasp.sweep],
-        loader=rendering.grasp_loader(grasp, base_url(request)),
+        loader=rendering.grasp_loader_code(grasp, base_url(request)),
     )
 
 
 def tag_choices(
     tags: Tags, rows: Sequence[GraspView], known: Sequence[TagView], where: Mapping[str, str]
 ) -> dict[str, Any]:
-    tagged = tags.of([(grasp.shard_id, grasp.row) for grasp in rows])
+    tagged = tags.names_by_grasp([(grasp.shard_id, grasp.row) for grasp in rows])
     return {"tagged": tagged, "tags": known, "filter": urlencode(where)}
 
 
-def _names(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
+def _asset_names(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
     return [(name, name) for name in sorted({asset.name for asset in assets.page(kind, limit=200).items})]
 
 
@@ -156,12 +156,12 @@ T = TypeVar("T")
 
 @router.post("/grasps/tag", dependencies=SUBMIT)
 def tag(tags: TagsOf, fields: Fields) -> RedirectResponse:
-    return _tag(tags, fields, on=True)
+    return _change_tag(tags, fields, on=True)
 
 
 @router.post("/grasps/untag", dependencies=SUBMIT)
 def untag(tags: TagsOf, fields: Fields) -> RedirectResponse:
-    return _tag(tags, fields, on=False)
+    return _change_tag(tags, fields, on=False)
 
 
 @router.post("/grasps/export", dependencies=READ)
@@ -182,22 +182,22 @@ def action_summary(given: dict[str, str]) -> str:
     return _DONE[what].format(done=f"{int(done):,}", grasps="grasp" if int(done) == 1 else "grasps", tag=name)
 
 
-def _tag(tags: Tags, fields: FormData, *, on: bool) -> RedirectResponse:
+def _change_tag(tags: Tags, fields: FormData, *, on: bool) -> RedirectResponse:
     name = _validate(_NAME, fields.get("tag"), "tag")
     selection = _selection(fields)
-    change = tags.give(name, selection) if on else tags.untag(name, selection)
+    change = tags.tag_grasps(name, selection) if on else tags.untag_grasps(name, selection)
     said = {"did": "tagged" if on else "untagged", "done": change.changed, "named": name}
     here = str(fields.get("here", ""))
     if _PAGES.fullmatch(here) and here != "/grasps":
         return RedirectResponse(f"{here}?{urlencode(said)}", status_code=303)
     view = {"view": "table"} if fields.get("view") == "table" else {}
-    return RedirectResponse(f"/grasps?{urlencode(dict(_filter(fields)) | view | said)}", status_code=303)
+    return RedirectResponse(f"/grasps?{urlencode(dict(_filter_fields(fields)) | view | said)}", status_code=303)
 
 
 def _selection(fields: FormData) -> Selection:
     try:
         if fields.get("all"):
-            return Selection(filter=GraspQuery.model_validate(dict(_filter(fields))))
+            return Selection(filter=GraspQuery.model_validate(dict(_filter_fields(fields))))
         places = [str(one).partition(":") for one in fields.getlist("grasp")]
         if not places:
             raise InputError("no grasp is selected; select some, or all that match the filters")
@@ -207,7 +207,7 @@ def _selection(fields: FormData) -> Selection:
         raise InputError(first_message(error)) from None
 
 
-def _filter(fields: FormData) -> list[tuple[str, str]]:
+def _filter_fields(fields: FormData) -> list[tuple[str, str]]:
     text = str(fields.get("filter", ""))
     try:
         # A truncated filter would select more grasps than the list shows.

@@ -17,7 +17,7 @@ from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf
 from graspd.service.index.views import AssetView
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.states import AssetKind
-from graspd.service.store.asset_summary import hand_line, limit_line, self_test_line
+from graspd.service.store.asset_summary import hand_line, payload_line, self_test_line
 from graspd.service.store.descriptions import MAX_ENTRIES, HandFacts
 
 PAGE_SIZE: Final = 50
@@ -53,9 +53,9 @@ def hands_page(
 
 @router.get("/{name}", dependencies=READ)
 def hand_page(request: Request, name: str, assets: AssetsOf) -> HTMLResponse:
-    hand = assets.one(AssetKind.HAND, name)
-    facts, trouble = _facts(assets, hand)
-    return _page(request, hand, facts, problem=trouble, form=_form_of(facts) if facts else {})
+    hand = assets.get(AssetKind.HAND, name)
+    facts, trouble = _load_facts(assets, hand)
+    return _render_hand(request, hand, facts, problem=trouble, form=_form_of(facts) if facts else {})
 
 
 @router.post("/{name}", dependencies=SUBMIT, response_model=None)
@@ -65,7 +65,7 @@ async def correct(request: Request, name: str, assets: AssetsOf) -> HTMLResponse
 
 
 def _correct(request: Request, assets: Assets, name: str, fields: FormData) -> HTMLResponse | RedirectResponse:
-    hand = assets.one(AssetKind.HAND, name)
+    hand = assets.get(AssetKind.HAND, name)
     facts = assets.hand_facts(hand)
     shown = _form_of(facts) | {key: value for key, value in fields.multi_items() if isinstance(value, str)}
     shown["fingertips"] = [str(value) for value in fields.getlist("fingertip")]
@@ -73,11 +73,11 @@ def _correct(request: Request, assets: Assets, name: str, fields: FormData) -> H
         said = CorrectionRequest.model_validate(dict(_changed_fields(facts, shown)))
         made = store_correction(assets, hand.digest, said, said.name)
     except (InputError, ConflictError, ValueError) as error:
-        return _page(request, hand, facts, problem=first_message(error), form=shown, status=422)
+        return _render_hand(request, hand, facts, problem=first_message(error), form=shown, status=422)
     return RedirectResponse(f"/hands/{made.digest}", status_code=303)
 
 
-def _page(
+def _render_hand(
     request: Request, hand: AssetView, facts: HandFacts | None, *, problem: str, form: dict[str, Any], status: int = 200
 ) -> HTMLResponse:
     guessed = hand.facts.get("guessed")
@@ -96,11 +96,11 @@ def _page(
         form=form,
         guessed=guessed if isinstance(guessed, list) else [],
         self_test=self_test_line(hand.facts),
-        limit=limit_line(hand.facts),
+        limit=payload_line(hand.facts),
     )
 
 
-def _facts(assets: Assets, hand: AssetView) -> tuple[HandFacts | None, str]:
+def _load_facts(assets: Assets, hand: AssetView) -> tuple[HandFacts | None, str]:
     """Return the facts of a hand, or why it cannot be shown; neither while its check runs."""
     try:
         return assets.hand_facts(hand), ""
@@ -128,23 +128,23 @@ def _changed_fields(facts: HandFacts, form: dict[str, Any]) -> Iterator[tuple[st
         yield "name", name
     palm = [f"{what}_{axis}" for what in ("centre", "approach") for axis in "xyz"]
     if any(form[key] != before[key] for key in ("palm_link", *palm)):
-        x, y, z, *approach = (_number(form, key) for key in palm)
+        x, y, z, *approach = (_parse_number(form, key) for key in palm)
         yield "palm", {"link": form["palm_link"], "centre": [x / 1e3, y / 1e3, z / 1e3], "approach": approach}
-    for name, read in (("closing", _direction), ("preshape", _number)):
+    for name, read in (("closing", _parse_direction), ("preshape", _parse_number)):
         keys = {dof: f"{name}.{number}" for number, dof in enumerate(facts.dofs)}
         yield name, {dof: read(form, key) for dof, key in keys.items() if form[key] != before[key]}
     if set(form["fingertips"]) != set(facts.fingertips):
         yield "fingertips", form["fingertips"]
 
 
-def _number(form: dict[str, Any], key: str) -> float:
+def _parse_number(form: dict[str, Any], key: str) -> float:
     try:
         return float(form[key])
     except ValueError:
         raise InputError(f"{key.replace('_', ' ')} {form[key][:40]!r} is no number") from None
 
 
-def _direction(form: dict[str, Any], key: str) -> int:
+def _parse_direction(form: dict[str, Any], key: str) -> int:
     if form[key] not in ("-1", "0", "1"):
         raise InputError(f"{key} {form[key][:40]!r} must be -1, 0 or 1")
     return int(form[key])

@@ -31,8 +31,8 @@ router = APIRouter(include_in_schema=False)
 
 @router.get("/jobs/{job_id}", dependencies=READ)
 def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags: TagsOf) -> HTMLResponse:
-    job = jobs.one(job_id)
-    pictures = _pictures(job)
+    job = jobs.get(job_id)
+    pictures = _list_pictures(job)
     shown = {key: (label, unit) for key, label, unit in COLUMNS}
     validated = job.request.validation != "none"
     query = GraspQuery(job=job_id, valid=True if validated else None)
@@ -45,7 +45,8 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         refresh_s=0 if job.state.is_final else 3,
         job=job,
         histograms=[
-            (*shown[data.metric], data, figures.bars(data, "/grasps", where)) for data in grasps.statistics(job)[0]
+            (*shown[data.metric], data, figures.histogram_bars(data, "/grasps", where))
+            for data in grasps.statistics(job)[0]
         ],
         pictures=pictures[:_SHOWN_PICTURES],
         picture_count=len(pictures),
@@ -59,8 +60,8 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         columns=COLUMNS,
         sort="epsilon",
         shards=job.shards,
-        loader=rendering.loader(job, base_url(request)),
-        curl=rendering.curl(job, base_url(request)),
+        loader=rendering.job_loader_code(job, base_url(request)),
+        curl=rendering.curl_commands(job, base_url(request)),
     )
 
 
@@ -76,12 +77,12 @@ def picture(
     channel: Channel = "rgb",
     width: Annotated[int | None, Query(ge=16, le=4096)] = None,
 ) -> Response:
-    shard = shards.one(shard_id)
+    shard = shards.get(shard_id)
     data = request.app.state.pictures.png(shard.key, shard.sha256, index, channel, width)
     return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"})
 
 
-def _pictures(job: JobDetail) -> list[dict[str, Any]]:
+def _list_pictures(job: JobDetail) -> list[dict[str, Any]]:
     """List all rendered pictures; the left one of a stereo pair comes first."""
     eyes = ("left", "right") if job.request.stereo else ("",)
     return [
@@ -110,7 +111,7 @@ _CLASSES: Final = np.array(
 )
 
 
-class Pictures:
+class ShardPictures:
     """Decoder of pictures of views shards, with a cache of recent shards."""
 
     def __init__(self, store: Store) -> None:

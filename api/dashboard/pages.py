@@ -17,8 +17,8 @@ from graspd.api.access.keys import SESSION_S, KeyFile
 from graspd.api.catalog import events
 from graspd.api.catalog.overview import MINUTES, Overview
 from graspd.api.dashboard import dataset_pages, figures, forms, grasp_pages, hand_pages, job_pages, tradeoff
-from graspd.api.dashboard.forms import Expectations
-from graspd.api.dashboard.job_pages import Pictures
+from graspd.api.dashboard.forms import FormEstimates
+from graspd.api.dashboard.job_pages import ShardPictures
 from graspd.api.dashboard.rendering import environment, render
 from graspd.api.models import STAGE_LABELS
 from graspd.api.routes.dependencies import (
@@ -188,7 +188,7 @@ Typed = Annotated[str, Form(max_length=64)]
 @router.get("/deleted", dependencies=READ)
 def deleted_page(request: Request, deletions: DeletionsOf, done: str = "") -> HTMLResponse:
     """Show the deletions that can be undone; `done` is the id of the latest deletion."""
-    found = deletions.recent()
+    found = deletions.list_restorable()
     return render(request, "deleted.html", found=found, just_now=next((one for one in found if one.id == done), None))
 
 
@@ -203,32 +203,32 @@ def restore(what: What, name: str, deletions: DeletionsOf) -> RedirectResponse:
 def delete_dataset(
     name: str, datasets: DatasetsOf, typed: Typed = "", with_snapshots: Annotated[bool, Form()] = False
 ) -> RedirectResponse:
-    _confirmed(typed, name)
+    _require_confirmation(typed, name)
     datasets.delete(name, with_snapshots=with_snapshots)
-    return _deleted(name)
+    return _redirect_to_deletions(name)
 
 
 @router.post("/jobs/{job_id}/delete", dependencies=SUBMIT)
 def delete_job(job_id: str, jobs: JobsOf, typed: Typed = "") -> RedirectResponse:
-    _confirmed(typed, job_id, job_id[:SHORT_ID])
+    _require_confirmation(typed, job_id, job_id[:SHORT_ID])
     jobs.delete(job_id)
-    return _deleted(job_id)
+    return _redirect_to_deletions(job_id)
 
 
 @router.post("/tags/{name}/delete", dependencies=SUBMIT)
 def delete_tag(name: str, tags: TagsOf, typed: Typed = "") -> RedirectResponse:
-    _confirmed(typed, name)
-    tag = tags.one(name)
-    tags.remove(name)
-    return _deleted(tag.id)
+    _require_confirmation(typed, name)
+    tag = tags.get(name)
+    tags.delete(name)
+    return _redirect_to_deletions(tag.id)
 
 
-def _confirmed(typed: str, *names: str) -> None:
+def _require_confirmation(typed: str, *names: str) -> None:
     if typed.strip() not in names:
         raise InputError(f"nothing was deleted; to confirm the deletion, type {names[-1]}")
 
 
-def _deleted(id: str) -> RedirectResponse:
+def _redirect_to_deletions(id: str) -> RedirectResponse:
     return RedirectResponse(f"/deleted?done={id}", status_code=303)
 
 
@@ -243,10 +243,10 @@ routers: Final = (
 )
 
 
-def install(app: FastAPI, services: Services) -> None:
+def install_dashboard(app: FastAPI, services: Services) -> None:
     app.state.templates = environment()
-    app.state.pictures = Pictures(services.store)
-    app.state.expectations = Expectations(services.index)
+    app.state.pictures = ShardPictures(services.store)
+    app.state.expectations = FormEstimates(services.index)
 
 
 @router.get("/events", dependencies=READ, response_class=EventSourceResponse)

@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 from graspd.api import formatting
 from graspd.api.access.auth import is_allowed, may_change
 from graspd.api.access.keys import Scope
-from graspd.api.middleware.request_context import with_prefix
+from graspd.api.middleware.request_context import add_prefix
 from graspd.api.models import GraspDetail, JobDetail
 from graspd.service.model.version import PACKAGE_VERSION
 
@@ -58,7 +58,7 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
         "grace_s": request.app.state.settings.shard_grace_s,
     }
     text = request.app.state.templates.get_template(template).render(context)
-    text = with_prefix(text, request.app.state.settings.api_root_path or "")
+    text = add_prefix(text, request.app.state.settings.api_root_path or "")
     return HTMLResponse(text, status_code=status, headers={"Cache-Control": "no-store"})
 
 
@@ -73,7 +73,7 @@ def problem_page(request: Request, problem: dict[str, Any]) -> Response:
     return render(request, "problem.html", status=problem["status"], problem=problem, health=None)
 
 
-def loader(job: JobDetail, base_url: str) -> str:
+def job_loader_code(job: JobDetail, base_url: str) -> str:
     if not any(shard.kind == "base" for shard in job.shards):
         return ""
     return f"""import graspd  # pip install 'graspd[api]'
@@ -86,11 +86,11 @@ best.joint_positions  # (N, J) rad or m, in the order of best.joint_names
 print(grasps)"""
 
 
-def curl(job: JobDetail, base_url: str) -> str:
+def curl_commands(job: JobDetail, base_url: str) -> str:
     return "\n".join(f"curl -fL -o {shard.kind}-{shard.batch:04}.h5 {base_url}{shard.file}" for shard in job.shards)
 
 
-def grasp_loader(grasp: GraspDetail, base_url: str) -> str:
+def grasp_loader_code(grasp: GraspDetail, base_url: str) -> str:
     return f"""import graspd  # pip install 'graspd[api]'
 
 with graspd.Client("{base_url}") as client:  # key="..." where the service asks for one

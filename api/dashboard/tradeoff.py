@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 from graspd.service.model.errors import DamagedError
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.service.model.studies import FILTERED, pareto
+from graspd.service.model.studies import FILTERED, pareto_front
 from graspd.service.store.records import CHARTS, latest_record, scene_kinds
 from graspd.service.store.store import Store
 
@@ -53,7 +53,7 @@ IN_SCENES: Final[dict[str, Axis]] = {
 }
 
 
-class Run(BaseModel):
+class ChartRun(BaseModel):
     """Run of a method at a fidelity on a hand and object; `way`: how grasps in a scene were made."""
 
     method: str
@@ -86,7 +86,7 @@ class Run(BaseModel):
         return self.name if self.fidelity == _NO_FIDELITY else f"{self.name} {self.fidelity}"
 
     @property
-    def found(self) -> int | None:
+    def grasp_count(self) -> int | None:
         """Number of valid grasps, or of lifted grasps in a scene; None in charts of graspd 0.1."""
         return self.kept if self.lift_count is None else self.lift_count
 
@@ -95,12 +95,12 @@ class Run(BaseModel):
         return sum(self.end_seconds) if isinstance(self.end_seconds, list) else self.end_seconds or 0.0
 
     @property
-    def first_s(self) -> float | None:
+    def first_valid_s(self) -> float | None:
         return self.seconds_to_first_valid if self.seconds_to_first is None else self.seconds_to_first
 
 
-class Measured(BaseModel):
-    runs: list[Run]
+class PublishedChart(BaseModel):
+    runs: list[ChartRun]
     created: str | None = None
     device: str | None = None
     scene: SceneSpec | None = None
@@ -154,45 +154,45 @@ class Drawing:
     """Methods and fidelities without a grasp, which have no speed."""
 
 
-def load_charts(store: Store) -> list[Measured]:
+def load_charts(store: Store) -> list[PublishedChart]:
     """Load the newest published chart of each kind, free objects first, without unreadable charts."""
     found = []
     for kind in (CHARTS, *scene_kinds(store)):
         with suppress(ValueError, DamagedError):
             if (content := latest_record(store, kind)) is not None:
-                found.append(Measured.model_validate(content))
+                found.append(PublishedChart.model_validate(content))
     return found
 
 
-def draw_chart(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> Drawing:
+def draw_chart(measured: PublishedChart, *, axis: str, hand: str = "", object: str = "") -> Drawing:
     """Draw every method and fidelity over the runs of a hand and an object; an empty name means all."""
     shown = measured.axes[axis]
     chosen = [run for run in measured.runs if hand in ("", run.hand) and object in ("", run.object)]
     names = sorted({run.name for run in measured.runs})
     groups = [group for group in _groups(chosen) if any(getattr(run, axis) is not None for run in group)]
-    points = [point for group in groups if (point := _point(group, axis, shown.factor, names)) is not None]
+    points = [point for group in groups if (point := _mean_point(group, axis, shown.factor, names)) is not None]
     points.sort(key=lambda point: point.speed)
-    front = pareto([(p.speed, p.accuracy if shown.more_is_better else -p.accuracy) for p in points])
-    across, x_ticks = _logarithmic([point.speed for point in points])
-    up, y_ticks = _linear([point.accuracy for point in points], top=100.0 if shown.unit == "%" else None)
+    front = pareto_front([(p.speed, p.accuracy if shown.more_is_better else -p.accuracy) for p in points])
+    across, x_ticks = _logarithmic_scale([point.speed for point in points])
+    up, y_ticks = _linear_scale([point.accuracy for point in points], top=100.0 if shown.unit == "%" else None)
     shown_at = (replace(p, on_front=n in front, x=across(p.speed), y=up(p.accuracy)) for n, p in enumerate(points))
     placed = _place_labels(list(shown_at))
     line = " ".join(f"{point.x:.1f},{point.y:.1f}" for point in placed if point.on_front)
-    nothing = [group[0].label for group in _groups(chosen) if not _speed(group)]
+    nothing = [group[0].label for group in _groups(chosen) if not _mean_speed(group)]
     return Drawing(placed, line, x_ticks, y_ticks, shown, nothing)
 
 
-def _groups(runs: Sequence[Run]) -> list[list[Run]]:
-    groups: dict[tuple[str, str], list[Run]] = {}
+def _groups(runs: Sequence[ChartRun]) -> list[list[ChartRun]]:
+    groups: dict[tuple[str, str], list[ChartRun]] = {}
     for run in runs:
         groups.setdefault((run.name, run.fidelity), []).append(run)
     return list(groups.values())
 
 
-def _point(runs: list[Run], axis: str, scale: float, names: list[str]) -> Point | None:
-    speed = _speed(runs)
+def _mean_point(runs: list[ChartRun], axis: str, scale: float, names: list[str]) -> Point | None:
+    speed = _mean_speed(runs)
     values = [value for run in runs if (value := getattr(run, axis)) is not None]
-    firsts = [run.first_s for run in runs if run.first_s is not None]
+    firsts = [run.first_valid_s for run in runs if run.first_valid_s is not None]
     if not speed or not values:
         return None
     return Point(
@@ -207,11 +207,11 @@ def _point(runs: list[Run], axis: str, scale: float, names: list[str]) -> Point 
     )
 
 
-def _speed(runs: Sequence[Run]) -> float:
+def _mean_speed(runs: Sequence[ChartRun]) -> float:
     """Return the number of grasps per second of total time.
     In charts of graspd 0.1, it is the geometric mean speed."""
-    if all(run.found is not None for run in runs) and (seconds := sum(run.seconds for run in runs)):
-        return sum(run.found or 0 for run in runs) / seconds
+    if all(run.grasp_count is not None for run in runs) and (seconds := sum(run.seconds for run in runs)):
+        return sum(run.grasp_count or 0 for run in runs) / seconds
     speeds = [run.valid_per_second for run in runs if run.valid_per_second]
     return math.exp(sum(map(math.log, speeds)) / len(speeds)) if speeds else 0.0
 
@@ -244,24 +244,26 @@ def _outside_cost(box: tuple[float, float, float, float]) -> float:
     return 1e4 * sum(max(0.0, part) for part in over)
 
 
-def _logarithmic(values: Sequence[float]) -> tuple[Callable[[float], float], list[tuple[float, str]]]:
+def _logarithmic_scale(values: Sequence[float]) -> tuple[Callable[[float], float], list[tuple[float, str]]]:
     low, high = (min(values), max(values)) if values else (0.1, 10.0)
     start, end = math.log10(low / 1.6), math.log10(high * 2.4)
 
-    def place(value: float) -> float:
+    def position(value: float) -> float:
         return _LEFT + (math.log10(value) - start) / (end - start) * (WIDTH - _LEFT - _RIGHT)
 
     ticks = [m * 10.0**e for e in range(math.floor(start), math.ceil(end) + 1) for m in (1, 2, 5)]
-    return place, [(place(tick), f"{tick:g}") for tick in ticks if start <= math.log10(tick) <= end]
+    return position, [(position(tick), f"{tick:g}") for tick in ticks if start <= math.log10(tick) <= end]
 
 
-def _linear(values: Sequence[float], *, top: float | None) -> tuple[Callable[[float], float], list[tuple[float, str]]]:
+def _linear_scale(
+    values: Sequence[float], *, top: float | None
+) -> tuple[Callable[[float], float], list[tuple[float, str]]]:
     highest = max(values, default=1.0)
     end = top if top is not None else highest * 1.15 or 1.0
     size = 10.0 ** math.floor(math.log10(end / 5))
     step = next(size * m for m in (1, 2, 2.5, 5, 10) if size * m >= end / 5 * 0.999)
 
-    def place(value: float) -> float:
+    def position(value: float) -> float:
         return HEIGHT - _BOTTOM - value / end * (HEIGHT - _TOP - _BOTTOM)
 
-    return place, [(place(step * i), f"{step * i:g}") for i in range(int(end / step + 1e-9) + 1)]
+    return position, [(position(step * i), f"{step * i:g}") for i in range(int(end / step + 1e-9) + 1)]

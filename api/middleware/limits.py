@@ -21,7 +21,7 @@ from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from graspd.api.access.auth import Proxy, authorize, identify
+from graspd.api.access.auth import Proxy, authenticate, authorize
 from graspd.api.access.auth import caller as present_caller
 from graspd.api.access.keys import Key, KeyFile
 from graspd.api.access.keys import Scope as KeyScope
@@ -51,18 +51,18 @@ class RateLimit(HttpMiddleware):
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         is_open = self.keys.is_open
-        key = scope.setdefault("state", {})["key"] = None if is_open else identify(scope, self.keys, self.proxy)
+        key = scope.setdefault("state", {})["key"] = None if is_open else authenticate(scope, self.keys, self.proxy)
         token = present_caller.set(key)
         try:
             with bind_subjects(key=key.name if key else ""):
                 if is_open or scope["path"].startswith(_FREE):
                     await self.app(scope, receive, send)
                 else:
-                    await self._count(scope, receive, send, key)
+                    await self._enforce_limits(scope, receive, send, key)
         finally:
             present_caller.reset(token)
 
-    async def _count(self, scope: Scope, receive: Receive, send: Send, key: Key | None) -> None:
+    async def _enforce_limits(self, scope: Scope, receive: Receive, send: Send, key: Key | None) -> None:
         request = Request(scope)
         name = f"key:{key.name}" if key else f"address:{request.client.host if request.client else ''}"
         allowance = _allowance_of(key, self.settings)
@@ -72,7 +72,7 @@ class RateLimit(HttpMiddleware):
         if admission is None:
             await self.app(scope, receive, send)
             return
-        headers = _headers(allowance, admission)
+        headers = _rate_limit_headers(allowance, admission)
         if admission.refused:
             await error_response(request, _refusal(admission, allowance, headers))(scope, receive, send)
             return
@@ -85,7 +85,7 @@ class RateLimit(HttpMiddleware):
             elif time.monotonic() - kept > HELD_S / 3:
                 # A long response renews the request's entry.
                 kept = time.monotonic()
-                await self.rates.keep(name, number)
+                await self.rates.renew(name, number)
             await send(message)
 
         try:
@@ -105,17 +105,17 @@ def _allowance_of(key: Key | None, settings: Settings) -> Allowance:
     )
 
 
-def _headers(allowance: Allowance, admission: Admission) -> dict[str, str]:
+def _rate_limit_headers(allowance: Allowance, admission: Admission) -> dict[str, str]:
     if not allowance.per_minute:
         return {}
     return {
         "RateLimit-Policy": f'"requests";q={allowance.per_minute};w={WINDOW_S}',
-        "RateLimit": f'"requests";r={admission.remaining};t={_seconds_up(admission.seconds)}',
+        "RateLimit": f'"requests";r={admission.remaining};t={_whole_seconds(admission.seconds)}',
     }
 
 
 def _refusal(admission: Admission, allowance: Allowance, headers: dict[str, str]) -> ApiError:
-    wait = _seconds_up(admission.seconds)
+    wait = _whole_seconds(admission.seconds)
     if admission.refused == "concurrency":
         reason, headers = f"{allowance.concurrency} of your requests are in progress, the maximum at once", {}
     else:
@@ -204,7 +204,7 @@ class Rates:
         refused, remaining, seconds = (part.decode() for part in reply)
         return Admission(refused, int(remaining), float(seconds))
 
-    async def keep(self, caller: str, request: str) -> None:
+    async def renew(self, caller: str, request: str) -> None:
         await self._run(_KEEP, (f"graspd:held:{caller}",), (request, HELD_S))
 
     async def leave(self, caller: str, request: str) -> None:
@@ -233,7 +233,7 @@ class Rates:
         return self._client
 
 
-def _seconds_up(seconds: float) -> int:
+def _whole_seconds(seconds: float) -> int:
     return max(1, math.ceil(seconds))
 
 
@@ -264,9 +264,9 @@ class BodyLimit(HttpMiddleware):
         if (refusal := _body_refusal(scope, limit, is_upload=is_upload)) is not None:
             await _refuse(refusal, scope, receive, send)
         else:
-            await self._watch(scope, receive, send, limit)
+            await self._enforce_limit(scope, receive, send, limit)
 
-    async def _watch(self, scope: Scope, receive: Receive, send: Send, limit: int) -> None:
+    async def _enforce_limit(self, scope: Scope, receive: Receive, send: Send, limit: int) -> None:
         received, began = 0, time.monotonic()
         is_whole = is_answered = False
         refusal: Exception | None = None
@@ -292,14 +292,14 @@ class BodyLimit(HttpMiddleware):
                 return {"type": "http.disconnect"}
             return message
 
-        async def guarded(message: Message) -> None:
+        async def send_once(message: Message) -> None:
             nonlocal is_answered
             if refusal is not None and not is_answered:
                 return
             is_answered = True
             await send(message)
 
-        await self.app(scope, counted, guarded)
+        await self.app(scope, counted, send_once)
         if refusal is not None and not is_answered:
             await _refuse(refusal, scope, receive, send)
 

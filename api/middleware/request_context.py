@@ -1,7 +1,7 @@
 """Middleware of all routes: request ids, security headers, HEAD (RFC 9110 §9.3.2), prefix, origin.
 
 The application's paths have no prefix. `RootPath` removes the prefix from paths of requests, unless the proxy already
-did, and adds it to response headers; rendering adds it to addresses in pages (`with_prefix`).
+did, and adds it to response headers; rendering adds it to addresses in pages (`add_prefix`).
 """
 
 from __future__ import annotations
@@ -69,9 +69,9 @@ class RequestContext(HttpMiddleware):
         request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex[:16]
         scope.setdefault("state", {})["request_id"] = request_id
         with bind_subjects(request=request_id):
-            await self._answer(scope, receive, send, request_id)
+            await self._handle_request(scope, receive, send, request_id)
 
-    async def _answer(self, scope: Scope, receive: Receive, send: Send, request_id: str) -> None:
+    async def _handle_request(self, scope: Scope, receive: Receive, send: Send, request_id: str) -> None:
         started, status = time.perf_counter(), 0
 
         async def with_headers(message: Message) -> None:
@@ -97,9 +97,9 @@ class RequestContext(HttpMiddleware):
                 raise
             await scope["app"].state.answer_error(Request(scope), error)(scope, receive, with_headers)
         finally:
-            self._note(scope, status, time.perf_counter() - started)
+            self._record_request(scope, status, time.perf_counter() - started)
 
-    def _note(self, scope: Scope, status: int, seconds: float) -> None:
+    def _record_request(self, scope: Scope, status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", "unmatched")
         self.metrics.observe(_method(scope), route, status, seconds)
         level = logging.DEBUG if scope["path"].startswith(_QUIET) else logging.INFO
@@ -114,7 +114,7 @@ def _method(scope: Scope) -> str:
     return scope["method"] if scope["method"] in _METHODS else "other"
 
 
-class Head(HttpMiddleware):
+class HeadMethod(HttpMiddleware):
     """Answers HEAD like GET without the body, unless a route has its own HEAD."""
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -164,27 +164,27 @@ class RootPath(HttpMiddleware):
                 scope["raw_path"] = raw.removeprefix(self.prefix.encode()) or b"/"
         host = Headers(scope=scope).get("host", "")
 
-        async def prefixed(message: Message) -> None:
+        async def add_prefix_to_location(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 if (where := headers.get("location")) is not None:
-                    headers["location"] = self._below(where, host)
+                    headers["location"] = self._add_prefix(where, host)
                 if cookies := headers.getlist("set-cookie"):
                     del headers["set-cookie"]
                     for cookie in cookies:
                         headers.append("set-cookie", _COOKIE_PATH.sub(f"; Path={self.prefix}", cookie))
             await send(message)
 
-        await self.app(scope, receive, prefixed)
+        await self.app(scope, receive, add_prefix_to_location)
 
-    def _below(self, where: str, host: str) -> str:
+    def _add_prefix(self, where: str, host: str) -> str:
         parts = urlsplit(where)
         if parts.netloc not in ("", host) or not parts.path.startswith("/"):
             return where  # Such as a signed address of the store.
         return parts._replace(path=f"{self.prefix}{parts.path}").geturl()
 
 
-def with_prefix(page: str, prefix: str) -> str:
+def add_prefix(page: str, prefix: str) -> str:
     """Add the prefix to a page's addresses on this host."""
     return _ADDRESS.sub(rf"\g<1>{prefix}", page) if prefix else page
 
@@ -213,12 +213,12 @@ class SameOrigin(HttpMiddleware):
         site, origin = headers.get("sec-fetch-site"), headers.get("origin")
         if site not in (None, "same-origin", "none"):
             return ApiError(403, "the request comes from another web site; open the dashboard itself and try again")
-        if origin is not None and _place(origin) != host:
+        if origin is not None and _host_of_origin(origin) != host:
             return ApiError(403, f"the request comes from {origin}; open the dashboard itself and try again")
         return None
 
 
-def _place(origin: str) -> str | None:
+def _host_of_origin(origin: str) -> str | None:
     try:
         return urlsplit(origin).netloc
     except ValueError:

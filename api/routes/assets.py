@@ -43,12 +43,12 @@ def asset_router(kind: AssetKind) -> APIRouter:
         refused: Annotated[bool, Query(description="include assets that the check refused")] = False,
     ) -> Page[AssetView]:
         """List all assets of this kind, newest first; refused ones only on request."""
-        return paging.linked(assets.page(kind, limit=paging.limit, cursor=paging.cursor, refused=refused))
+        return paging.add_next_link(assets.page(kind, limit=paging.limit, cursor=paging.cursor, refused=refused))
 
     @router.get("/{name}", dependencies=READ, responses=problem_responses(404), name=f"get_{kind}")
     def get_asset(name: str, assets: AssetsOf) -> AssetView:
         """Return an asset with the findings of its check."""
-        return assets.one(kind, name)
+        return assets.get(kind, name)
 
     if kind is not AssetKind.NETWORK:
         _add_model_route(router, kind)
@@ -109,7 +109,7 @@ def _add_model_route(router: APIRouter, kind: AssetKind) -> None:
     )
     def get_model(name: str, request: Request, assets: AssetsOf) -> Response:
         """Return the prepared hand (with its joint tree) or object, in metres; `name` may be a digest."""
-        asset = assets.one(kind, name)
+        asset = assets.get(kind, name)
         # Content under a digest never changes; a name may later refer to another asset.
         lasting = "private, max-age=31536000, immutable" if name == asset.digest else "no-cache"
         data = assets.model(asset)

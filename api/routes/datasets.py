@@ -64,19 +64,19 @@ router.routes.append(Route("/v1/datasets/estimate", _NoDataset(), include_in_sch
 @router.get("", dependencies=READ)
 def list_datasets(datasets: DatasetsOf, paging: PagingOf) -> Page[DatasetView]:
     """List datasets, newest first."""
-    return paging.linked(datasets.page(limit=paging.limit, cursor=paging.cursor))
+    return paging.add_next_link(datasets.page(limit=paging.limit, cursor=paging.cursor))
 
 
 @router.get("/{name}", dependencies=READ, responses=problem_responses(404))
 def get_dataset(name: DatasetName, datasets: DatasetsOf) -> DatasetView:
     """Return a dataset's numbers: cells by state, grasps, progress, time, bytes."""
-    return datasets.one(name)
+    return datasets.get(name)
 
 
 @router.get("/{name}/cells", dependencies=READ, responses=problem_responses(404))
 def list_cells(name: DatasetName, datasets: DatasetsOf, paging: PagingOf, state: State | None = None) -> Page[CellView]:
     """List each cell (hand x object) with its job, state, yield and failures, ordered by hand."""
-    return paging.linked(datasets.cells(name, state=state, limit=paging.limit, cursor=paging.cursor))
+    return paging.add_next_link(datasets.cells(name, state=state, limit=paging.limit, cursor=paging.cursor))
 
 
 @router.post("/{name}/cancel", status_code=202, dependencies=SUBMIT, responses=problem_responses(404, 409))
@@ -121,7 +121,7 @@ def take_snapshot(name: DatasetName, response: Response, datasets: DatasetsOf) -
 @router.get("/{name}/snapshots", dependencies=READ, responses=problem_responses(404))
 def list_snapshots(name: DatasetName, datasets: DatasetsOf, paging: PagingOf) -> Page[SnapshotView]:
     """List snapshots of a dataset, newest first."""
-    return paging.linked(datasets.snapshots(name, limit=paging.limit, cursor=paging.cursor))
+    return paging.add_next_link(datasets.snapshots(name, limit=paging.limit, cursor=paging.cursor))
 
 
 @router.get("/{name}/snapshots/{digest}", dependencies=READ, responses=problem_responses(404))

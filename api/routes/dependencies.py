@@ -32,7 +32,7 @@ from graspd.service.store.store import Store
 T = TypeVar("T")
 
 
-def provide(app: FastAPI, services: Services) -> None:
+def install_services(app: FastAPI, services: Services) -> None:
     """Create the objects that routes depend on, from these services."""
     redis = connect(redis_url(services.settings), patience=1)
     state = app.state
@@ -53,44 +53,44 @@ def provide(app: FastAPI, services: Services) -> None:
     state.grasp_exports = GraspExports(services, state.grasps, state.tags)
 
 
-def may_read(request: Request) -> None:
+def require_read(request: Request) -> None:
     authorize(request, Scope.READ)
 
 
-def may_submit(request: Request) -> None:
+def require_submit(request: Request) -> None:
     authorize(request, Scope.SUBMIT)
 
 
-READ: Final = [Depends(may_read)]
-SUBMIT: Final = [Depends(may_submit)]
+READ: Final = [Depends(require_read)]
+SUBMIT: Final = [Depends(require_submit)]
 
 
-def may_scrape(request: Request) -> None:
+def require_metrics_access(request: Request) -> None:
     """Raise ApiError unless the caller may read, or the settings permit all callers."""
     if request.app.state.settings.metrics_need_key:
         authorize(request, Scope.READ)
 
 
-def _provided(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
+def _service_dependency(name: str) -> Callable[[Request], Coroutine[Any, Any, Any]]:
     # A coroutine, because FastAPI would run a plain function in a thread.
-    async def found(request: Request) -> Any:
+    async def get_service(request: Request) -> Any:
         return getattr(request.app.state, name)
 
-    return found
+    return get_service
 
 
-JobsOf = Annotated[Jobs, Depends(_provided("jobs"))]
-DatasetsOf = Annotated[Datasets, Depends(_provided("datasets"))]
-AssetsOf = Annotated[Assets, Depends(_provided("assets"))]
-GraspsOf = Annotated[Grasps, Depends(_provided("grasps"))]
-ShardsOf = Annotated[Shards, Depends(_provided("shards"))]
-StoreOf = Annotated[Store, Depends(_provided("store"))]
-UsageOf = Annotated[Usage, Depends(_provided("usage"))]
-TagsOf = Annotated[Tags, Depends(_provided("tags"))]
-ExportsOf = Annotated[GraspExports, Depends(_provided("grasp_exports"))]
-DeletionsOf = Annotated[Deletions, Depends(_provided("deletions"))]
-WebhooksOf = Annotated[Webhooks, Depends(_provided("webhooks"))]
-OverviewOf = Annotated[Overview, Depends(_provided("overview"))]
+JobsOf = Annotated[Jobs, Depends(_service_dependency("jobs"))]
+DatasetsOf = Annotated[Datasets, Depends(_service_dependency("datasets"))]
+AssetsOf = Annotated[Assets, Depends(_service_dependency("assets"))]
+GraspsOf = Annotated[Grasps, Depends(_service_dependency("grasps"))]
+ShardsOf = Annotated[Shards, Depends(_service_dependency("shards"))]
+StoreOf = Annotated[Store, Depends(_service_dependency("store"))]
+UsageOf = Annotated[Usage, Depends(_service_dependency("usage"))]
+TagsOf = Annotated[Tags, Depends(_service_dependency("tags"))]
+ExportsOf = Annotated[GraspExports, Depends(_service_dependency("grasp_exports"))]
+DeletionsOf = Annotated[Deletions, Depends(_service_dependency("deletions"))]
+WebhooksOf = Annotated[Webhooks, Depends(_service_dependency("webhooks"))]
+OverviewOf = Annotated[Overview, Depends(_service_dependency("overview"))]
 Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]
 Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the previous page")]
 
@@ -104,7 +104,7 @@ class Paging:
     limit: int
     cursor: str | None
 
-    def linked(self, page: Page[T]) -> Page[T]:
+    def add_next_link(self, page: Page[T]) -> Page[T]:
         """Set the Link header (RFC 8288) to the next page, with the same filters."""
         if page.next is not None:
             self.response.headers["Link"] = f'<{next_address(self.request, page.next)}>; rel="next"'

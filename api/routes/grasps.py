@@ -28,7 +28,7 @@ router = APIRouter(prefix="/v1/grasps", tags=["grasps"])
 def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> GraspDetail:
     """Return one grasp with its postures, and its metrics at every contact threshold."""
     response.headers["Cache-Control"] = "private, max-age=86400"
-    return grasps.one(shard_id, row)
+    return grasps.get(shard_id, row)
 
 
 @router.get(
@@ -54,7 +54,9 @@ async def export_response(
     request: Request, tags: Tags, exports: GraspExports, selection: Selection, format: Format
 ) -> StreamingResponse:
     said = selection.model_dump(mode="json", exclude_none=True)
-    size, chunks = await request.app.state.exports.run(lambda: exports.export(tags.chosen(selection), format, said))
+    size, chunks = await request.app.state.exports.run(
+        lambda: exports.export(tags.resolve_selection(selection), format, said)
+    )
     headers = {"Content-Length": str(size), "Cache-Control": "private, no-store"}
     headers["Content-Disposition"] = f'attachment; filename="grasps.{format}"'
     return StreamingResponse(chunks, media_type=MEDIA_TYPES[format], headers=headers)
@@ -66,7 +68,7 @@ def list_grasps(
 ) -> Page[GraspView]:
     """List grasps that pass every filter, in the requested order."""
     paging = Paging(request, response, query.limit, query.cursor)
-    return paging.linked(grasps.page(query, limit=query.limit, cursor=query.cursor))
+    return paging.add_next_link(grasps.page(query, limit=query.limit, cursor=query.cursor))
 
 
 tag_router = APIRouter(prefix="/v1/tags", tags=["tags"])
@@ -83,22 +85,22 @@ def list_tags(tags: TagsOf) -> list[TagView]:
 @tag_router.post("", dependencies=SUBMIT, responses=problem_responses(400, 404, 409))
 def give_tag(body: TagRequest, tags: TagsOf) -> TagChange:
     """Give a tag to listed or filtered grasps; create the tag if it is new."""
-    return tags.give(body.name, body)
+    return tags.tag_grasps(body.name, body)
 
 
 @tag_router.get("/{name}", dependencies=READ, responses=problem_responses(404))
 def get_tag(name: TagName, tags: TagsOf) -> TagView:
     """Return a tag; `GET /v1/grasps?tag=NAME` lists its grasps."""
-    return tags.one(name)
+    return tags.get(name)
 
 
 @tag_router.post("/{name}/remove", dependencies=SUBMIT, responses=problem_responses(400, 404, 409))
-def take_tag_off(name: TagName, body: Selection, tags: TagsOf) -> TagChange:
+def remove_tag(name: TagName, body: Selection, tags: TagsOf) -> TagChange:
     """Remove a tag from listed or filtered grasps."""
-    return tags.untag(name, body)
+    return tags.untag_grasps(name, body)
 
 
 @tag_router.delete("/{name}", status_code=204, dependencies=SUBMIT, responses=problem_responses(404, 409))
 def delete_tag(name: TagName, tags: TagsOf) -> None:
     """Delete a tag; its grasps remain."""
-    tags.remove(name)
+    tags.delete(name)

@@ -53,13 +53,13 @@ def list_jobs(
 ) -> Page[Job]:
     """List jobs, newest first."""
     page = jobs.page(state=state, hand=hand, object=object, prefix=prefix, limit=paging.limit, cursor=paging.cursor)
-    return paging.linked(page)
+    return paging.add_next_link(page)
 
 
 @router.get("/{job_id}", dependencies=READ, responses=problem_responses(404))
 def get_job(job_id: str, jobs: JobsOf) -> JobDetail:
     """Return a job with the progress of its stages, failed attempts, mean metrics and shards."""
-    return jobs.one(job_id)
+    return jobs.get(job_id)
 
 
 @router.post("/{job_id}/cancel", status_code=202, dependencies=SUBMIT, responses=problem_responses(404, 409))
@@ -112,13 +112,13 @@ def list_shards(
     kind: Literal["base", "scene", "views"] | None = None,
 ) -> Page[Shard]:
     """List shards, all or those of a job."""
-    return paging.linked(shards.page(job=job, kind=kind, limit=paging.limit, cursor=paging.cursor))
+    return paging.add_next_link(shards.page(job=job, kind=kind, limit=paging.limit, cursor=paging.cursor))
 
 
 @shard_router.get("/{shard_id}", dependencies=READ, responses=problem_responses(404))
 def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
     """Return a shard with its whole manifest."""
-    return shards.one(shard_id)
+    return shards.get(shard_id)
 
 
 @shard_router.head("/{shard_id}/file", dependencies=READ, include_in_schema=False)

@@ -14,11 +14,20 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from graspd.api.access.auth import is_allowed
 from graspd.api.access.keys import Scope
 from graspd.api.catalog import events
-from graspd.api.catalog.overview import DeletionView, as_csv
+from graspd.api.catalog.overview import DeletionView, usage_csv
 from graspd.api.metrics import CONTENT_TYPE, Metrics
 from graspd.api.models import Health, Worker
 from graspd.api.problems import problem_responses
-from graspd.api.routes.dependencies import READ, SUBMIT, DeletionsOf, Limit, OverviewOf, UsageOf, WebhooksOf, may_scrape
+from graspd.api.routes.dependencies import (
+    READ,
+    SUBMIT,
+    DeletionsOf,
+    Limit,
+    OverviewOf,
+    UsageOf,
+    WebhooksOf,
+    require_metrics_access,
+)
 from graspd.service.index.views import DeliveryView, EndView, Stats, UsageDay, WebhookView
 from graspd.service.model.webhooks import MAX_URL, End
 from graspd.service.store.records import What
@@ -62,27 +71,27 @@ def readyz(request: Request, overview: OverviewOf, response: Response) -> Health
 
 @router.get(
     "/metrics",
-    dependencies=[Depends(may_scrape)],
+    dependencies=[Depends(require_metrics_access)],
     response_class=Response,
     responses=problem_responses(others={200: {"content": {"text/plain": {}}}}),
 )
 def metrics(request: Request, overview: OverviewOf) -> Response:
     """Return metrics as Prometheus text. If a part is down, only its series are missing."""
     values: Metrics = request.app.state.metrics
-    return Response(values.render(overview.snapshot()), media_type=CONTENT_TYPE)
+    return Response(values.render(overview.metrics_snapshot()), media_type=CONTENT_TYPE)
 
 
 usage_router = APIRouter(tags=["usage"])
 
 
-def _day(said: object) -> object:
+def _check_day(said: object) -> object:
     """Reject numbers (pydantic would read seconds since 1970) and times (it would drop the time of day)."""
     if isinstance(said, str) and not re.fullmatch(r"[0-9]{4}-[0-9]{2}-[0-9]{2}", said):
         raise ValueError("a day is written as 2026-01-31")
     return said
 
 
-Day = Annotated[date, BeforeValidator(_day)]
+Day = Annotated[date, BeforeValidator(_check_day)]
 Since = Annotated[Day | None, Query(description="first day (UTC); default: 30 days before the last day")]
 Until = Annotated[Day | None, Query(description="last day (UTC); default: today")]
 
@@ -104,7 +113,7 @@ def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[
 def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> Response:
     """Return the data of `/v1/usage` as CSV."""
     headers = {"Content-Disposition": 'attachment; filename="usage.csv"'}
-    return Response(as_csv(usage.days(since, until)), media_type="text/csv", headers=headers)
+    return Response(usage_csv(usage.days(since, until)), media_type="text/csv", headers=headers)
 
 
 deletion_router = APIRouter(tags=["deletions"])
@@ -115,7 +124,7 @@ Name = Annotated[str, Path(max_length=64, description="name or id of the resourc
 @deletion_router.get("/v1/deletions", dependencies=READ)
 def list_deletions(deletions: DeletionsOf) -> list[DeletionView]:
     """List deletions that can be undone, newest first."""
-    return deletions.recent()
+    return deletions.list_restorable()
 
 
 def _add_restore(what: What) -> None:
@@ -165,7 +174,7 @@ class CreatedWebhook(WebhookView):
 @event_router.get("/v1/events", dependencies=READ)
 def list_ends(webhooks: WebhooksOf, since: AfterEnd = 0, limit: Limit = 50) -> DeliveryPage:
     """List ended jobs and datasets, oldest first. Ends are stored for 30 days; each appears at least once."""
-    items = webhooks.ends(since, limit=limit)
+    items = webhooks.end_events(since, limit=limit)
     return DeliveryPage(items=items, next=items[-1].seq if items else since)
 
 
@@ -178,7 +187,7 @@ async def stream_ends(
 ) -> AsyncIterable[ServerSentEvent]:
     """Stream an `end` event per ended job or dataset; a client that reconnects continues where it stopped."""
     start = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else since
-    async for event in events.ends(webhooks, min(start, 2**62), request):
+    async for event in events.end_events(webhooks, min(start, 2**62), request):
         yield event
 
 
@@ -199,7 +208,7 @@ def list_webhooks(webhooks: WebhooksOf) -> list[WebhookView]:
 @event_router.get("/v1/webhooks/{webhook_id}/deliveries", dependencies=SUBMIT, responses=problem_responses(404))
 def list_deliveries(webhook_id: WebhookId, webhooks: WebhooksOf, limit: Limit = 50) -> list[DeliveryView]:
     """List deliveries of a webhook, newest first; stored for 30 days."""
-    return webhooks.log(webhook_id, limit=limit)
+    return webhooks.deliveries(webhook_id, limit=limit)
 
 
 @event_router.delete(

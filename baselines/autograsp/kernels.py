@@ -120,7 +120,7 @@ def bodies_to_pieces(
 
 
 @wp.func
-def nearest_of(
+def least_gap(
     closing: Closing,
     b: wp.int32,
     d: wp.int32,
@@ -163,7 +163,7 @@ def close(
         if stopped_inout[b, d] == 0:
             for body in range(near_in.shape[1]):
                 if closing_in.moves[d, body] == 1:
-                    if nearest_of(closing_in, b, d, body, near_in, pair_in) < touch_in:
+                    if least_gap(closing_in, b, d, body, near_in, pair_in) < touch_in:
                         stopped_inout[b, d] = 1
     open_dofs = wp.int32(0)
     for d in range(dofs):
@@ -179,7 +179,7 @@ def close(
                             for k in range(dofs):
                                 if stopped_inout[b, k] == 0:
                                     travel += closing_in.lever[k, body]
-                            gap = nearest_of(closing_in, b, e, body, near_in, pair_in)
+                            gap = least_gap(closing_in, b, e, body, near_in, pair_in)
                             step = wp.min(step, share_in * gap / wp.max(travel, 1.0e-6))
             value = q_inout[b, d] + closing_in.direction[d] * step
             if value <= closing_in.lower[d] or value >= closing_in.upper[d]:

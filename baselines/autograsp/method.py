@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from graspd.baselines.autograsp import kernels
-from graspd.baselines.common import free_starts, grasp_set, load_pair
+from graspd.baselines.common import collision_free_starts, create_grasp_set, load_pair
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
@@ -46,7 +46,7 @@ class Autograsp:
 
         def work(indices: range) -> HandState:
             n = len(indices)
-            state = free_starts(pair, seed=wanted.seed, batch=wanted.batch, indices=indices)
+            state = collision_free_starts(pair, seed=wanted.seed, batch=wanted.batch, indices=indices)
             steps(n, "starts")
             closer = HandCloser(pair, n)
             state = closer.approach(state, self.options.standoff_m)
@@ -56,7 +56,7 @@ class Autograsp:
             return state
 
         states = run_parts(split_batch(wanted.count, run), work)
-        return grasp_set(pair, HandState.joined(states), began, {})
+        return create_grasp_set(pair, HandState.concatenate(states), began, {})
 
 
 METHOD: Final = Method(

@@ -211,7 +211,7 @@ def self_penetration(
 
 
 @wp.kernel
-def limits(
+def limit_violation(
     # Model:
     lower_in: wp.array(dtype=wp.float32),
     upper_in: wp.array(dtype=wp.float32),
@@ -248,7 +248,7 @@ def total_energy(terms: wp.array2d(dtype=wp.float32), b: wp.int32):
 
 
 @wp.func
-def accepted(rise: wp.float32, t: wp.float32, uniform: wp.float32):
+def is_accepted(rise: wp.float32, t: wp.float32, uniform: wp.float32):
     """Return 1 if the energy falls, or with probability exp(-rise / t) if it rises; else 0 (Metropolis)."""
     if rise < 0.0 or uniform < wp.exp(-rise / t):
         return 1
@@ -282,7 +282,7 @@ def accept(
     uniform = wp.randf(rng)
     rng_inout[b] = rng
     rise = total_energy(new_terms_in, b) - total_energy(terms_inout, b)
-    if accepted(rise, temperature(iteration_in[0]), uniform) == 0:
+    if is_accepted(rise, temperature(iteration_in[0]), uniform) == 0:
         return
     taken_inout[b] = taken_inout[b] + 1
     pivot_inout[b] = new_pivot_in[b]

@@ -14,7 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.common import frame_along, grasp_set, inner_side_points, load_pair
+from graspd.baselines.common import create_grasp_set, frame_along, inner_side_points, load_pair
 from graspd.baselines.dfc import kernels
 from graspd.service.model.transforms import (
     IDENTITY_POSE,
@@ -68,7 +68,7 @@ class Dfc:
 
         states, energies = zip(*run_parts(split_batch(wanted.count, run), work), strict=True)
         passed = (np.concatenate(energies)[:, :3] < np.array(PASSES)).all(axis=1)
-        return grasp_set(pair, HandState.joined(states), began, {"passed": passed.tolist()})
+        return create_grasp_set(pair, HandState.concatenate(states), began, {"passed": passed.tolist()})
 
 
 METHOD: Final = Method(
@@ -135,7 +135,7 @@ class Descent:
 
     def __init__(self, pair: Pair, starts: HandState, seeds: list[list[int]]) -> None:
         self.pair, self.n = pair, len(starts.pivot)
-        self.obj = pair.fine.obj.thinned(SAMPLES)
+        self.obj = pair.fine.obj.with_fewer_samples(SAMPLES)
         self.candidates = inner_side_points(pair.hand.model, each=EACH, on_palm=ON_PALM)
         # Model of the proposals; only its kinematics is computed.
         self.model = Model.create(pair.hand, self.obj, pair.coarse.points, pair.coarse.own, pair.options)
@@ -148,7 +148,7 @@ class Descent:
             self.rng = wp.array(random, dtype=wp.uint32)
             self._allocate(contacts)
         self.proposal.set_state(starts)
-        for mine, other in zip(self.state, self._proposed(), strict=True):
+        for mine, other in zip(self.state, self._proposal_arrays(), strict=True):
             wp.copy(mine, other)
         self.launches = self._record()
 
@@ -167,14 +167,14 @@ class Descent:
         self.pairs = len(first)
         self.keys = [wp.array(v, dtype=wp.int32) for v in (first, second, body)] + [wp.array(place, dtype=wp.vec3)]
 
-    def _proposed(self) -> list[Any]:
+    def _proposal_arrays(self) -> list[Any]:
         return [self.proposal.pivot, self.proposal.rotation, self.proposal.q]
 
     def _record(self) -> Launches:
         s, m, n, out = self.proposal, self.model, self.n, Launches(self.device)
         pose, own = [s.body_p, s.body_q], [self.new_terms, s.wrench]
         present = [*self.state, self.contact]
-        proposed = [*self._proposed(), self.new_contact]
+        proposed = [*self._proposal_arrays(), self.new_contact]
         given = [len(self.candidates), s.iteration, self.gradient, *present]
         out.add(kernels.propose, n, inputs=given, outputs=[self.rng, self.moment, *proposed, self.new_terms])
         add_poses(out, m, s)
@@ -185,7 +185,9 @@ class Descent:
         if self.pairs:
             out.add(kernels.self_penetration, (n, self.pairs), inputs=[*self.keys, *pose], outputs=own)
         add_root_gradient(out, m, s)
-        out.add(kernels.limits, n, inputs=[m.hand.lower, m.hand.upper, s.q], outputs=[self.new_terms, s.gradient])
+        out.add(
+            kernels.limit_violation, n, inputs=[m.hand.lower, m.hand.upper, s.q], outputs=[self.new_terms, s.gradient]
+        )
         kept = [self.rng, self.terms, self.gradient, *present, self.taken]
         out.add(kernels.accept, n, inputs=[s.iteration, self.new_terms, s.gradient, *proposed], outputs=kept)
         out.add(optimizers.advance, 1, inputs=[], outputs=[s.iteration])
@@ -200,7 +202,7 @@ class Descent:
 
     def hands(self) -> HandState:
         """Return the accepted hands, with joints clipped to their limits."""
-        for mine, other in zip(self._proposed(), self.state, strict=True):
+        for mine, other in zip(self._proposal_arrays(), self.state, strict=True):
             wp.copy(mine, other)
         found = self.proposal.state(self.n)
         hand = self.pair.hand.model

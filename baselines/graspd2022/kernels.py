@@ -95,7 +95,7 @@ def multipliers(
 
 
 @wp.func
-def relaxed(physics: ForceModel, force: wp.vec3, wanted: wp.vec3, actual: wp.vec3):
+def force_gradient(physics: ForceModel, force: wp.vec3, wanted: wp.vec3, actual: wp.vec3):
     """Return the gradient of mismatch |F - f|^2 with respect to F, plus the pull of `multipliers`."""
     return 2.0 * physics.mismatch * (force - actual) + wanted
 
@@ -143,7 +143,7 @@ def relax(
         torque_pull = wp.vec3(pull[3], pull[4], pull[5]) / physics.gyration
         wanted = wp.vec3(pull[0], pull[1], pull[2]) + wp.cross(torque_pull, x)
         force = force_inout[b, i, j]
-        g = relaxed(physics, force, wanted, actual)
+        g = force_gradient(physics, force, wanted, actual)
         m = 0.9 * first_inout[b, i, j] + 0.1 * g
         old = largest_inout[b, i, j]
         u = wp.vec3(
@@ -166,7 +166,7 @@ def relax(
 
 
 @wp.kernel
-def nearest(
+def nearest_distance(
     # Model:
     surface: Surface,
     point_body_in: wp.array(dtype=wp.int32),

@@ -15,7 +15,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.common import cached_search, free_starts, grasp_set, load_pair
+from graspd.baselines.common import cached_search, collision_free_starts, create_grasp_set, load_pair
 from graspd.baselines.graspd2022 import kernels
 from graspd.service.model.cores import available_cores
 from graspd.service.model.transforms import Floats, quat_rotate
@@ -72,13 +72,13 @@ class Graspd2022:
         steps = StepCounter(wanted.count * (self.options.steps + 1), run)
 
         def work(indices: range) -> tuple[HandState, Floats]:
-            starts = free_starts(pair, seed=wanted.seed, batch=wanted.batch, indices=indices)
+            starts = collision_free_starts(pair, seed=wanted.seed, batch=wanted.batch, indices=indices)
             steps(len(indices), "starts")
             return search.run(starts, steps=self.options.steps, tell=steps)
 
         states, residuals = zip(*run_parts(split_batch(wanted.count, run), work), strict=True)
         info: dict[str, object] = {"residual": np.concatenate(residuals).round(4).tolist()}
-        return grasp_set(pair, HandState.joined(states), began, info)
+        return create_grasp_set(pair, HandState.concatenate(states), began, info)
 
 
 METHOD: Final = Method(
@@ -124,7 +124,7 @@ def schedule(steps: int) -> Schedule:
     return Schedule(dilation, zero, zero, own, rates)
 
 
-def physics_of(gyration: float) -> Any:
+def force_model(gyration: float) -> Any:
     """Return the constants for the kernels; `gyration` [m] weighs torques."""
     out = kernels.ForceModel()
     out.stiffness, out.viscous, out.friction, out.leak = STIFFNESS, VISCOUS, FRICTION, LEAK
@@ -140,7 +140,7 @@ class _Batch:
         self.model = Model.create(pair.hand, pair.fine.obj, search.points, pair.coarse.own, pair.options)
         self.data = Data(self.model, n)
         self.device = self.model.device
-        self.physics = physics_of(pair.fine.obj.model.gyration_radius)
+        self.physics = force_model(pair.fine.obj.model.gyration_radius)
         velocity = SPEED * np.array([[0.0, 0, 0], [1, 1, 1], [-1, -1, -1]])
         self.wanted = np.concatenate([MASS / STEP_S * velocity, np.zeros((3, 3))], axis=1)
         with wp.ScopedDevice(self.device):
@@ -152,10 +152,10 @@ class _Batch:
             self.multiplier, self.gap = (wp.zeros((n, 3), dtype=wp.float32) for _ in range(2))
         self.data.set_schedule(schedule(steps))
         self.data.set_state(starts)
-        self.data.dilation_scale.assign(self._first_dilation())
+        self.data.dilation_scale.assign(self._initial_dilation_scale())
         self.launches = self._record()
 
-    def _first_dilation(self) -> NDArray[np.float32]:
+    def _initial_dilation_scale(self) -> NDArray[np.float32]:
         """Return (n,) shares of `MAX_DILATION` that put the dilated object `APART_M` from each hand."""
         m, d, poses = self.model, self.data, Launches(self.device)
         add_poses(poses, m, d)
@@ -163,7 +163,7 @@ class _Batch:
         with wp.ScopedDevice(self.device):
             least = wp.full(self.n, 1e3, dtype=wp.float32)
             points = [m.point_body, m.point_position, d.body_p, d.body_q]
-            wp.launch(kernels.nearest, (self.n, POINTS), inputs=[self.grid, *points], outputs=[least])
+            wp.launch(kernels.nearest_distance, (self.n, POINTS), inputs=[self.grid, *points], outputs=[least])
             return np.clip((least.numpy() - APART_M) / MAX_DILATION, 0.0, 1.0).astype(np.float32)
 
     def _record(self) -> Launches:

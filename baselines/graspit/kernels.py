@@ -92,7 +92,9 @@ def joint_value(problem: Problem, x: vec8, d: wp.int32):
 
 
 @wp.func
-def place(problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)):
+def pose_bodies(
+    problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
+):
     """Compute the poses of all bodies."""
     rotation = rotation_of(problem, x)
     body_q[b, 0] = rotation
@@ -115,7 +117,7 @@ def place(problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.ve
 
 
 @wp.func
-def clashes(problem: Problem, x: vec8):
+def has_self_collision(problem: Problem, x: vec8):
     """Return 1 if the nearest posture of the grid has a self-collision."""
     rows = problem.clash.shape[0] - 1
     columns = problem.clash.shape[1] - 1
@@ -125,7 +127,7 @@ def clashes(problem: Problem, x: vec8):
 
 
 @wp.func
-def inside(problem: Problem, point: wp.vec3):
+def is_inside_object(problem: Problem, point: wp.vec3):
     """Return 1 for a point inside the object; query the mesh only near the surface."""
     coarse = field_distance(problem.surface, point).distance
     if coarse > problem.surface.field_error:
@@ -148,7 +150,7 @@ def points_collide(problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.ve
             gap = field_distance(problem.surface, p + wp.quat_rotate(q, problem.points.centre[body])).distance
             if gap < problem.points.radius[body] + problem.surface.field_error:
                 for i in range(first, last):
-                    if inside(problem, p + wp.quat_rotate(q, problem.points.position[i])) == 1:
+                    if is_inside_object(problem, p + wp.quat_rotate(q, problem.points.position[i])) == 1:
                         return 1
     return 0
 
@@ -208,11 +210,13 @@ def contact_energy(problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.ve
 
 
 @wp.func
-def legal(problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)):
+def is_collision_free(
+    problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)
+):
     """Return 1 if a state has no collision; its body poses stay in the arrays."""
-    if clashes(problem, x) == 1:
+    if has_self_collision(problem, x) == 1:
         return 0
-    place(problem, b, x, body_p, body_q)
+    pose_bodies(problem, b, x, body_p, body_q)
     if points_collide(problem, b, body_p, body_q) == 1:
         return 0
     if samples_collide(problem, b, body_p, body_q) == 1:
@@ -221,7 +225,7 @@ def legal(problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.ve
 
 
 @wp.func
-def neighbour(problem: Problem, x: vec8, t: wp.float32, rng: wp.uint32):
+def neighbour_state(problem: Problem, x: vec8, t: wp.float32, rng: wp.uint32):
     """Return a neighbour state at temperature t with all variables in bounds, and the random state."""
     y = vec8()
     state = wp.uint32(rng)
@@ -243,7 +247,7 @@ def neighbour(problem: Problem, x: vec8, t: wp.float32, rng: wp.uint32):
 
 
 @wp.kernel
-def begin(
+def draw_start(
     # Model:
     problem: Problem,
     # In:
@@ -265,7 +269,7 @@ def begin(
         x = vec8()
         for i in range(VARIABLES):
             x[i] = problem.low[i] + wp.randf(rng) * (problem.high[i] - problem.low[i])
-        if legal(problem, b, x, body_p_out, body_q_out) == 1:
+        if is_collision_free(problem, b, x, body_p_out, body_q_out) == 1:
             found = 1
             state_out[b] = x
             energy_out[b] = contact_energy(problem, b, body_p_out, body_q_out)
@@ -341,8 +345,8 @@ def anneal(
         free = wp.int32(0)
         tries = wp.int32(0)
         while free == 0 and tries < TRIES:
-            y, rng = neighbour(problem, x, t, rng)
-            free = legal(problem, b, y, body_p_out, body_q_out)
+            y, rng = neighbour_state(problem, x, t, rng)
+            free = is_collision_free(problem, b, y, body_p_out, body_q_out)
             tries += 1
         if free == 1:
             energy = contact_energy(problem, b, body_p_out, body_q_out)

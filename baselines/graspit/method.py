@@ -20,7 +20,7 @@ from pydantic import Field
 
 from graspd.baselines.autograsp import kernels as closing_kernels
 from graspd.baselines.autograsp.method import HandCloser
-from graspd.baselines.common import cached_search, frame_along, grasp_set, inner_side_points, load_pair
+from graspd.baselines.common import cached_search, create_grasp_set, frame_along, inner_side_points, load_pair
 from graspd.baselines.graspit import kernels
 from graspd.baselines.graspit.kernels import FIRST_STEP
 from graspd.service.model.errors import InputError
@@ -65,7 +65,7 @@ class Search:
         out.origin = wp.array(self.eigen.origin, dtype=wp.float32)
         out.eigen = wp.array(self.eigen.directions, dtype=wp.float32)
         out.lower, out.upper = self.pair.hand.lower, self.pair.hand.upper
-        out.clash = wp.array(clash_grid(self.pair, self.eigen), dtype=wp.int32)
+        out.clash = wp.array(self_collision_grid(self.pair, self.eigen), dtype=wp.int32)
         return out
 
     def run(self, seeds: list[list[int]], *, steps: int, keep: int, tell: StepCounter) -> HandState:
@@ -81,7 +81,9 @@ class Search:
             best = wp.zeros((chains, keep), dtype=kernels.vec8)
             best_energy = wp.full((chains, keep), NOT_YET, dtype=wp.float32)
             scratch = [wp.zeros((chains, self.hand.bodies), dtype=kind) for kind in (wp.vec3, wp.quat)]
-            wp.launch(kernels.begin, chains, inputs=[self.problem, START_TRIES], outputs=[rng, state, energy, *scratch])
+            wp.launch(
+                kernels.draw_start, chains, inputs=[self.problem, START_TRIES], outputs=[rng, state, energy, *scratch]
+            )
             if (energy.numpy() < 0).any():
                 obj = self.pair.fine.obj.model
                 raise InputError(f"{self.hand.name} has no collision-free start around {obj.name}")
@@ -96,7 +98,7 @@ class Search:
                 done = now
                 if now >= chains * (steps - FIRST_STEP):
                     break
-            return self._hands(_sorted(best.numpy(), best_energy.numpy(), begun))
+            return self._hands(_sort_by_energy(best.numpy(), best_energy.numpy(), begun))
 
     def _hands(self, states: Floats) -> HandState:
         n = len(states)
@@ -131,8 +133,8 @@ class Graspit:
             state = search.run(seeds, steps=self.options.steps, keep=keep, tell=steps)
             return HandCloser(pair, len(state.pivot)).close(state)
 
-        states = HandState.joined(run_parts(split_batch(chains, run), work))
-        return grasp_set(pair, states[: wanted.count], began, {"chains": chains, "moves": moves})
+        states = HandState.concatenate(run_parts(split_batch(chains, run), work))
+        return create_grasp_set(pair, states[: wanted.count], began, {"chains": chains, "moves": moves})
 
 
 METHOD: Final = Method(
@@ -165,7 +167,7 @@ EACH: Final = 2
 ON_PALM: Final = 3
 
 
-def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
+def self_collision_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
     """Return (CLASH_GRID, CLASH_GRID): 1 for a posture whose self-overlap exceeds `CLASH_M`."""
     axes = [np.linspace(low, high, CLASH_GRID) for low, high in eigen.limits]
     amplitudes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -180,7 +182,7 @@ def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
     return (depth > CLASH_M).astype(np.int32).reshape(CLASH_GRID, CLASH_GRID)
 
 
-def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
+def _sort_by_energy(best: Floats, energy: Floats, begun: Floats) -> Floats:
     """Return states (chains * keep, 8), best first; missing ones repeat the chain's last one or its start."""
     out = np.empty_like(best)
     for c, (states, energies) in enumerate(zip(best, energy, strict=True)):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.learned.network import cloud_inputs, conditions, decode, flow
+from graspd.baselines.learned.network import cloud_inputs, decode, flow_conditions, integrate_flow
 from graspd.service.model.base import Digest
 from graspd.service.model.errors import InputError, SceneError
 from graspd.service.model.fidelity import Fidelity
@@ -45,19 +45,19 @@ class LearnedPlanner:
     options: LearnedOptions
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
-        return plan(hand, obj, wanted, run, warm=self._seeds(hand))
+        return plan(hand, obj, wanted, run, warm=self._network_starts(hand))
 
     def joined(self, hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest]) -> list[GraspSet | Exception]:
-        return plan_batches(hand, obj, asked, warm=self._seeds(hand))
+        return plan_batches(hand, obj, asked, warm=self._network_starts(hand))
 
-    def _seeds(self, hand: HandModel) -> Seeds:
+    def _network_starts(self, hand: HandModel) -> NetworkStarts:
         network = load_network(self.options.network)
         if network.joint_names != hand.joint_names or network.hand_digest != hand.digest:
             raise InputError(
                 f"network {self.options.network[:12]} proposes grasps of {network.hand} ({network.hand_digest[:12]}), "
                 f"not of {hand.name} ({hand.digest[:12]})"
             )
-        return Seeds(network, self.options.starts)
+        return NetworkStarts(network, self.options.starts)
 
 
 METHOD: Final = Method(
@@ -83,7 +83,7 @@ Generators = list[np.random.Generator]
 
 
 @dataclass(frozen=True)
-class Seeds:
+class NetworkStarts:
     """A `WarmStart` from a network's proposals.
     Starts of fast_graspd replace those without a free proposal."""
 
@@ -100,7 +100,7 @@ class Seeds:
         """Return starts and depths [m], see `clear_scene_starts`. Raises SceneError: the scenes have no table."""
         scene = np.repeat(placed.index, each)
         drawn, away = self._proposed(model, generators, each, placed)
-        state, depth = _clear(model, drawn, away, scene, placed)
+        state, depth = _retreat_until_clear(model, drawn, away, scene, placed)
         rest = np.flatnonzero(depth > CLEAR)
         if len(rest):
             own, depth[rest] = clear_scene_starts(
@@ -114,17 +114,17 @@ class Seeds:
     ) -> tuple[HandState, Floats]:
         """Return open hands (n * draws) and their retreat directions (n * draws, 3) by start; object frame."""
         hand, obj, table = model.hand.model, model.obj.model, table_height(placed.supports)
-        seen, draws = SurfaceView.of(obj), max(1, PROPOSALS // each)
+        seen, draws = SurfaceView.from_object(obj), max(1, PROPOSALS // each)
         pivot, rotation, q, away = [], [], [], []
         for number, scene in enumerate(placed.index.tolist()):
             mine = generators[number * each : (number + 1) * each]
             pose = np.asarray(placed.object_pose[scene], float)
             cloud = seen.cloud(pose, seen.camera(pose, mine[0]), self.network.points, mine[0])
             inputs, anchor = cloud_inputs(*cloud, table)
-            condition = conditions(self.network, inputs[None], anchor[2:] - table)
+            condition = flow_conditions(self.network, inputs[None], anchor[2:] - table)
             # Proposals of each grasp are computed separately, so that grasps are independent.
             noise = np.concatenate([g.standard_normal((draws, self.network.row_size)) for g in mine])
-            rows = flow(self.network, noise.astype(np.float32), np.repeat(condition, len(noise), axis=0))
+            rows = integrate_flow(self.network, noise.astype(np.float32), np.repeat(condition, len(noise), axis=0))
             found = decode(rows, anchor)
             at = compose(invert(pose), found.hand_pose)
             pivot.append(at[:, :3] + quat_rotate(at[:, 3:], hand.palm.centre) - obj.centre_of_mass)
@@ -143,7 +143,7 @@ def table_height(supports: Sequence[Obstacle]) -> float:
     return max(heights)
 
 
-def _clear(
+def _retreat_until_clear(
     model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: PlacedGrasps
 ) -> tuple[HandState, Floats]:
     """Return for each of n starts the free hand that retreats least, and its depth [m].
@@ -198,7 +198,7 @@ class SurfaceView:
     normals: Floats  # (DENSE, 3) unit outward normals
 
     @classmethod
-    def of(cls, obj: ObjectModel) -> SurfaceView:
+    def from_object(cls, obj: ObjectModel) -> SurfaceView:
         """Sample points uniformly over the surface's area; equal objects have equal points."""
         rng = np.random.default_rng(0)
         corners = obj.vertices[obj.faces]
@@ -216,7 +216,7 @@ class SurfaceView:
         level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         toward = np.cos(elevation) * level + np.sin(elevation) * np.array([0, 0, 1.0])
         distance = max(NEAREST_M + self.obj.radius, self.obj.radius / np.sin(fill * HALF_FIELD))
-        return np.asarray(self._middle(pose) + distance * toward)
+        return np.asarray(self._object_centre(pose) + distance * toward)
 
     def cloud(self, pose: Floats, camera: Floats, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
         """Sample points (count, 3) [m] and normals among the nearest points of a camera's pixels.
@@ -224,7 +224,7 @@ class SurfaceView:
         points, normals = quat_rotate(pose[3:], self.points) + pose[:3], quat_rotate(pose[3:], self.normals)
         rays = points - camera
         facing = np.flatnonzero((normals * rays).sum(axis=1) < 0)
-        toward = camera - self._middle(pose)
+        toward = camera - self._object_centre(pose)
         distance = float(np.linalg.norm(toward))
         toward = toward / distance
         right = cross(np.array([0, 0, 1.0]), toward)
@@ -238,5 +238,5 @@ class SurfaceView:
         drawn = shown[rng.choice(len(shown), count, replace=len(shown) < count)]
         return points[drawn], normals[drawn]
 
-    def _middle(self, pose: Floats) -> Floats:
+    def _object_centre(self, pose: Floats) -> Floats:
         return np.asarray(quat_rotate(pose[3:], self.obj.centre_of_mass) + pose[:3])

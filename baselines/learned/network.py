@@ -75,9 +75,9 @@ def propose(
     with z up; `table_height` is z of the table [m]. `label` is 1 for grasps that hold, 0 for grasps that fail. `spread`
     is the standard deviation of the noise: 1 as in training, below 1 for likelier and less diverse grasps."""
     inputs, anchor = cloud_inputs(points, normals, table_height)
-    condition = conditions(network, inputs[None], np.array([anchor[2] - table_height]), label)
+    condition = flow_conditions(network, inputs[None], np.array([anchor[2] - table_height]), label)
     noise = (spread * rng.standard_normal((count, network.row_size))).astype(np.float32)
-    return decode(flow(network, noise, np.repeat(condition, count, axis=0)), anchor)
+    return decode(integrate_flow(network, noise, np.repeat(condition, count, axis=0)), anchor)
 
 
 def cloud_inputs(points: ArrayLike, normals: ArrayLike, table_height: float) -> tuple[Floats32, Floats]:
@@ -94,12 +94,12 @@ def cloud_inputs(points: ArrayLike, normals: ArrayLike, table_height: float) -> 
     return np.concatenate([(p - anchor) / LENGTH_M, n, height], axis=1).astype(np.float32), anchor
 
 
-def conditions(network: ProposalNetwork, clouds: Floats32, height: Floats, label: float = 1.0) -> Floats32:
+def flow_conditions(network: ProposalNetwork, clouds: Floats32, height: Floats, label: float = 1.0) -> Floats32:
     """Return conditions (C, 258) of the flow for C clouds (C, P, 7) of `cloud_inputs`.
     `height` (C,) is the height of their anchors above the table [m]; for `label` see `propose`."""
     found = np.empty((len(clouds), CONDITION), np.float32)
     layers = _layers(network)
-    with np.errstate(all="ignore"):  # `flow` checks for overflow
+    with np.errstate(all="ignore"):  # `integrate_flow` checks for overflow
         for row, cloud in zip(found, clouds, strict=True):
             h = np.asarray(cloud, np.float32)
             for i in range(len(ENCODER) - 1):
@@ -110,7 +110,7 @@ def conditions(network: ProposalNetwork, clouds: Floats32, height: Floats, label
     return found
 
 
-def flow(network: ProposalNetwork, noise: Floats32, condition: Floats32) -> Floats32:
+def integrate_flow(network: ProposalNetwork, noise: Floats32, condition: Floats32) -> Floats32:
     """Integrate normal noise (n, D) under conditions (n, 258) to grasp rows: Euler steps, t = 0 to 1.
     Raises InputError: the result is not finite."""
     layers = _layers(network)
@@ -158,7 +158,7 @@ class _Layer:
     bias: Floats32
 
     @classmethod
-    def of(cls, network: ProposalNetwork, name: str) -> _Layer:
+    def from_network(cls, network: ProposalNetwork, name: str) -> _Layer:
         weight, bias = network.weights[f"{name}.weight"], network.weights[f"{name}.bias"]
         out, into = weight.shape
         width = max(1, _MULTIPLICATIONS // (_ROWS * into))
@@ -182,7 +182,7 @@ def _layers(network: ProposalNetwork) -> Mapping[str, _Layer]:
     """Return the layers by name, cached in the network."""
     if "layers" not in vars(network):
         names = [name.removesuffix(".bias") for name in network.weights if name.endswith(".bias")]
-        vars(network)["layers"] = {name: _Layer.of(network, name) for name in names}
+        vars(network)["layers"] = {name: _Layer.from_network(network, name) for name in names}
     found: Mapping[str, _Layer] = vars(network)["layers"]
     return found
 

@@ -23,7 +23,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.port import PlanRequest
-from graspd.worker.quality.intervals import wilson
+from graspd.worker.quality.intervals import wilson_interval
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.model import Scene
 from graspd.worker.validation.protocol import Test
@@ -90,7 +90,7 @@ def verdicts(scene: Scene, grasps: GraspSet) -> Bools:
 
 def share(good: int, total: int) -> Row:
     """Return a rate with its 95 % interval (Wilson)."""
-    low, high = wilson(int(good), total)
+    low, high = wilson_interval(int(good), total)
     return {"value": good / total, "low": low, "high": high, "n": total}
 
 

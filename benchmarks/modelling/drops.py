@@ -28,16 +28,16 @@ def drops(objects: list[ObjectModel], count: int) -> list[Row]:
     rows = []
     for obj in objects:
         pieces = decompose(obj)
-        hull = simulate._build(obj)
+        hull = simulate._build_table(obj)
         model = _in_pieces(obj, pieces, hull.model)
         tables = {"hull": hull, "pieces": replace(hull, model=model, data=mujoco.MjData(model))}
         rests, seconds = {}, {}
         for name, table in tables.items():
             with cpu() as clock:
-                rests[name] = [simulate._redo_until_rest(table, (SEED, k)) for k in range(count)]
+                rests[name] = [simulate._drop_until_rest(table, (SEED, k)) for k in range(count)]
             seconds[name] = clock.seconds
         faces = {name: np.array([rest.face for rest in found]) for name, found in rests.items()}
-        again = np.array([simulate._redo_until_rest(hull, (SEED + 1, k)).face for k in range(count)])
+        again = np.array([simulate._drop_until_rest(hull, (SEED + 1, k)).face for k in range(count)])
         rows.append(
             {
                 "object": obj.name,

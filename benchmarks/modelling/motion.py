@@ -23,7 +23,7 @@ from graspd.worker.quality.table import measure
 from graspd.worker.simulation.reference import World
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.displacement import simulated_displacement_cm
-from graspd.worker.validation.model import MujocoOptions, Scene, build
+from graspd.worker.validation.model import MujocoOptions, Scene, build_scene
 
 STEPS = (1, 3, 10)
 #: Number of hand points of the rollouts, between those of the planner's coarse and fine phases.
@@ -111,7 +111,7 @@ def validated(subjects: list[Subject]) -> tuple[list[Row], list[Bools], float]:
         held = []
         with cpu() as clock:
             for s in subjects:
-                scene = build(s.hand, s.obj, _hull(s) if hull else s.pieces, physics)
+                scene = build_scene(s.hand, s.obj, _hull(s) if hull else s.pieces, physics)
                 if change is not None:
                     change(scene)
                 held.append(verdicts(scene, s.grasps))

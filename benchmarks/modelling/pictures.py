@@ -13,7 +13,7 @@ from benchmarks.modelling.common import SEED, Row, cpu, object_of
 from graspd.service.model.transforms import apply, invert
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.rendering.cameras import Cameras
-from graspd.worker.rendering.scene_setup import CameraPlan, Setting
+from graspd.worker.rendering.scene_setup import CameraPlan, SceneSetup
 from graspd.worker.rendering.scenery import Pictures
 from graspd.worker.rendering.views import SAMPLES as SAMPLES_DEFAULT
 from graspd.worker.scenes.simulate import drop
@@ -30,7 +30,7 @@ def study(data: Path | None, name: str, width: int = 160) -> dict[str, Any]:
     obj, full = object_of(data, name), object_of(data, name, 0.0)
     poses = drop(obj, count=SCENES, seed=SEED)["scene/object_pose"]
     plan = CameraPlan(VIEWS, width, width * 3 // 4, None)
-    setting = Setting([obj], poses[:, None], plan, seed=SEED, samples=RAYS)
+    setting = SceneSetup([obj], poses[:, None], plan, seed=SEED, samples=RAYS)
     _shoot(setting, 2)
     best, _ = _shoot(setting, MANY)
     rows: list[Row] = []
@@ -47,7 +47,7 @@ def study(data: Path | None, name: str, width: int = 160) -> dict[str, Any]:
         pictures, seconds = _shoot(setting, RAYS)
         setattr(config, flag, before)
         rows.append(_row(what, pictures, plain, seconds / base))
-    other = Setting([full], poses[:, None], plan, seed=SEED, samples=RAYS)
+    other = SceneSetup([full], poses[:, None], plan, seed=SEED, samples=RAYS)
     # Keep the cameras, since cameras computed from the other hull differ by rounding.
     other.shot = replace(other.shot, extrinsics=setting.shot.extrinsics)
     _shoot(other, 2)
@@ -63,10 +63,10 @@ def study(data: Path | None, name: str, width: int = 160) -> dict[str, Any]:
     }
 
 
-def _shoot(setting: Setting, samples: int) -> tuple[Pictures, float]:
+def _shoot(setting: SceneSetup, samples: int) -> tuple[Pictures, float]:
     setting.shot = replace(setting.shot, samples=samples)
     with cpu() as clock:
-        pictures = setting.shoot(ExecutionContext(threads=1))
+        pictures = setting.render(ExecutionContext(threads=1))
     return pictures, clock.seconds
 
 
@@ -82,7 +82,7 @@ def _row(name: str, pictures: Pictures, reference: Pictures, ratio: float) -> Ro
     }
 
 
-def depth_error_mm(setting: Setting, pictures: Pictures, vertices: Any, faces: Any) -> dict[str, float]:
+def depth_error_mm(setting: SceneSetup, pictures: Pictures, vertices: Any, faces: Any) -> dict[str, float]:
     """Return distances of the object's unprojected pixels from a mesh: median, 99th percentile [mm]."""
     shot = setting.shot
     points = Cameras(shot.width, shot.height, shot.intrinsics, shot.extrinsics).unproject(pictures.depth)

@@ -23,7 +23,7 @@ from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.trajectory import Trajectory, plan_trajectory
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps, Scenes
 from graspd.worker.validation.lift import Lift
-from graspd.worker.validation.model import MujocoOptions, Scene, build
+from graspd.worker.validation.model import MujocoOptions, Scene, build_scene
 from graspd.worker.validation.protocol import Outcome, Rollout
 
 #: A table of 1.2 x 0.9 m, 30 mm thick.
@@ -77,7 +77,7 @@ def _supports(scene: Scene, friction: float | None = None, width_m: float | None
 
 
 def _no_hold(test: Lift, grasps: GraspSet, row: int) -> bool:
-    test._begin(grasps, row)
+    test._set_up_scene(grasps, row)
     if not test._close(grasps, row, give_up=True):
         return False
     test._rise(grasps, row)
@@ -115,7 +115,9 @@ def validated(tables: list[OnTable]) -> list[Row]:
         with cpu() as clock:
             for one in tables:
                 grasps, placed = one.clear
-                scene = build(one.subject.hand, one.subject.obj, one.subject.pieces, MujocoOptions(), placed.supports)
+                scene = build_scene(
+                    one.subject.hand, one.subject.obj, one.subject.pieces, MujocoOptions(), placed.supports
+                )
                 change(scene)
                 test = Lift(scene, placed)
                 held += [ask(test, grasps, row) for row in range(len(grasps))]

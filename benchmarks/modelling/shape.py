@@ -15,7 +15,7 @@ from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.probe import probe_of
 from graspd.worker.quality.volume import penetration_depth
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.model import MujocoOptions, build
+from graspd.worker.validation.model import MujocoOptions, build_scene
 
 STANDARD = FIDELITIES["standard"]
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -36,7 +36,7 @@ def study(data: Path | None, objects: list[str], count: int) -> dict[str, Any]:
     for name in objects:
         # All settings are validated with the pieces of the standard object.
         standard = object_of(data, name)
-        scenes[name] = build(hand, standard, decompose(standard), MujocoOptions())
+        scenes[name] = build_scene(hand, standard, decompose(standard), MujocoOptions())
     rows: list[Row] = []
     for setting, change in SETTINGS.items():
         fidelity = STANDARD.model_copy(update=change)

@@ -64,7 +64,7 @@ class Study:
 
     def __post_init__(self) -> None:
         self.seen = sights(self.shards, noise=NOISE)
-        names = sorted({file.object for file in self.shards.of("base")})
+        names = sorted({file.object for file in self.shards.of_kind("base")})
         self.objects = [name for name in names if name not in self.back]
         self.held = sources.Held(self.shards, self.objects)
         self.models = {name: object_from_path(self.meshes / name / "clean.stl") for name in names}
@@ -142,7 +142,7 @@ def main(
     model = hand_from_path(hand)
 
     def opened(where: str) -> Shards:
-        return open_shards(where).only(hands=[model.name])
+        return open_shards(where).select(hands=[model.name])
 
     others = {
         name: opened(where) for name, where in ((FREE, free), (BASELINE, baseline), (sources.FAILED, raw)) if where

@@ -27,7 +27,7 @@ _TOGETHER: Final = 32
 def valid_grasps(shards: Shards, obj: str) -> GraspSet | None:
     """Return the valid grasps of an object from all batches; None if there are none."""
     found = []
-    for file in sorted(shards.only(objects=[obj]).of("base"), key=lambda file: file.batch):
+    for file in sorted(shards.select(objects=[obj]).of_kind("base"), key=lambda file: file.batch):
         shard = read_shard(shards.path(file), kind="base")
         kept = np.flatnonzero(shard["quality/valid"] == 1)
         if len(kept):

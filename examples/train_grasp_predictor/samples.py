@@ -97,7 +97,7 @@ def taught(shards: Shards, obj: str, *, valid: bool = True) -> TrainedModel:
     """Return the grasps in an object's scenes, sorted by batch: valid ones, or all with a verdict."""
     scenes: list[Scene] = []
     rows, label, hard = [], [], []
-    for file in sorted(shards.only(objects=[obj]).of("base"), key=lambda file: file.batch):
+    for file in sorted(shards.select(objects=[obj]).of_kind("base"), key=lambda file: file.batch):
         shard = read_shard(shards.path(file), kind="base")
         # Grasps without a clear approach have no verdict and are omitted.
         kept = np.flatnonzero(

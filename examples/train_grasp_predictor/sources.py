@@ -35,7 +35,7 @@ class Held:
         self.face: dict[str, int] = {}
         self.poses: dict[Scene, Floats] = {}
         for obj in objects:
-            for file in shards.only(objects=[obj]).of("base"):
+            for file in shards.select(objects=[obj]).of_kind("base"):
                 poses = poses_of(read_shard(shards.path(file), kind="base"))
                 self.poses |= {Scene(obj, file.id, number): pose for number, pose in enumerate(poses)}
                 if obj not in self.face and len(poses) > 1:

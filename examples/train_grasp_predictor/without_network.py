@@ -13,7 +13,7 @@ from examples.train_grasp_predictor.samples import Floats, Sight, TrainedModel, 
 from graspd.baselines.learned.network import Proposals, decode
 from graspd.service.model.transforms import quat_from_matrix, quat_rotate
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.pinch_postures import oppositions_of
+from graspd.worker.hands.pinch_postures import pinch_postures_of
 from graspd.worker.simulation.environment import UP
 
 #: Random draws per returned hand, and largest angle between hand and vertical [rad].
@@ -42,7 +42,7 @@ def across(hand: HandModel, sight: Sight, count: int, *, squeeze: float, rng: np
         squeeze: angle by which joints close beyond contact [rad].
         rng: generator of directions.
     """
-    known, n = oppositions_of(hand), DRAWS * count
+    known, n = pinch_postures_of(hand), DRAWS * count
     turn, lean = rng.uniform(0, 2 * np.pi, n), rng.uniform(-LEANS, LEANS, n)
     axis = np.stack([np.cos(turn), np.sin(turn), np.zeros(n)], axis=1)
     along = (sight.points - sight.anchor) @ axis.T

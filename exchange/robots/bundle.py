@@ -11,7 +11,7 @@ import yaml
 
 from graspd.exchange.plan import plain_name, prim_names
 from graspd.exchange.robots.execution import Executions, Path, RobotTrajectory
-from graspd.exchange.robots.reach import Arm, ArmScene, Description
+from graspd.exchange.robots.reach import Arm, ArmScene, HandDescription
 from graspd.service.model.transforms import Floats, compose, invert
 
 
@@ -31,7 +31,7 @@ class Bundle:
 
     found: Executions
     trajectories: list[RobotTrajectory]  # one per grasp; joints are the arm's, if there is one, then the hand's
-    description: Description
+    description: HandDescription
     carrier: Carrier | None = None
 
     @property
@@ -55,7 +55,7 @@ class Bundle:
         _, thing, hand = prim_names(["scene", self.found.obj.name, self.found.hand.name])
         return thing, hand
 
-    def name(self, row: int) -> str:
+    def grasp_name(self, row: int) -> str:
         return f"grasp_{self.found.rows[row]:04}"
 
     @property
@@ -65,7 +65,7 @@ class Bundle:
         return [k for k, name in enumerate(names) if name not in self.description.mimics]
 
 
-class _Plain(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
+class _DumperWithoutAnchors(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
     """YAML without anchors, which some readers of messages do not support."""
 
     def ignore_aliases(self, data: Any) -> bool:
@@ -74,10 +74,10 @@ class _Plain(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[mis
 
 def dump_yaml(file: pathlib.Path, value: Any) -> pathlib.Path:
     """Write a value as YAML, in the order of its keys."""
-    file.write_text(yaml.dump(value, Dumper=_Plain, sort_keys=False, default_flow_style=None, width=120))
+    file.write_text(yaml.dump(value, Dumper=_DumperWithoutAnchors, sort_keys=False, default_flow_style=None, width=120))
     return file
 
 
-def numbers(values: Any) -> list[float]:
+def rounded_numbers(values: Any) -> list[float]:
     """Return floats rounded to nine decimals (nm, nrad), without negative zeros."""
     return [round(float(value), 9) + 0.0 for value in np.ravel(values)]

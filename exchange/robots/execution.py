@@ -79,7 +79,7 @@ class Executions:
         )
 
 
-def executions(
+def build_executions(
     hand: HandModel,
     obj: ObjectModel,
     grasps: GraspSet,
@@ -139,7 +139,7 @@ def parse_pose(text: str, what: str) -> Floats:
 def tool_frame(text: str | None, root_link: str, links: Mapping[str, tuple[int, Floats]]) -> ToolFrame:
     """Return the tool frame `text`; by default, the frame of the root link.
     `text` is a link that no finger moves, or a pose in the root link's frame. `links` has body and pose of each link,
-    see `Description`. Raises InputError: `text` is neither."""
+    see `HandDescription`. Raises InputError: `text` is neither."""
     if not text or text == root_link:
         return ToolFrame(root_link, IDENTITY_POSE.copy())
     if text in links:
@@ -179,7 +179,7 @@ _STEEPEST: Final = 15 / 8
 
 
 @dataclass(frozen=True)
-class Limits:
+class VelocityLimits:
     """Velocity limits of joints."""
 
     velocity: Floats  # (J,) [rad/s or m/s]
@@ -207,13 +207,13 @@ class RobotTrajectory:
     velocity: Floats  # (K, J) joint velocities, by differences
 
 
-def hand_limits(hand: HandModel) -> Limits:
+def velocity_limits(hand: HandModel) -> VelocityLimits:
     """Return velocity limits of a hand's joints: the description's, else `ASSUMED_RAD_S` or `ASSUMED_M_S`."""
     body = hand.joint_body
     stated = np.abs(hand.multiplier[body]) * hand.velocity[hand.dof[body]]
     default = np.where(hand.joint_type[body] == JointType.REVOLUTE, ASSUMED_RAD_S, ASSUMED_M_S)
     silent = tuple(name for name, known in zip(hand.joint_names, stated, strict=True) if known <= 0)
-    return Limits(np.where(stated > 0, stated, default), silent)
+    return VelocityLimits(np.where(stated > 0, stated, default), silent)
 
 
 def straight_paths(found: Executions, row: int, points: int = 2) -> list[Path]:

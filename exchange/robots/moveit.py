@@ -10,9 +10,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from graspd.exchange.imported import mesh_file, urdf_of
+from graspd.exchange.imported import urdf_text, write_mesh
 from graspd.exchange.plan import plain_name
-from graspd.exchange.robots.bundle import Bundle, dump_yaml, numbers
+from graspd.exchange.robots.bundle import Bundle, dump_yaml, rounded_numbers
 from graspd.exchange.robots.execution import RobotTrajectory
 from graspd.service.model.transforms import Floats
 
@@ -25,9 +25,9 @@ def write(bundle: Bundle, folder: Path, hand_files: Mapping[str, bytes]) -> list
     (folder / "trajectories").mkdir(parents=True, exist_ok=True)
     written = [dump_yaml(folder / "grasps.yaml", [_grasp(bundle, row) for row in range(len(bundle.found))])]
     for row, trajectory in enumerate(bundle.trajectories):
-        file = folder / "trajectories" / f"{bundle.name(row)}.yaml"
+        file = folder / "trajectories" / f"{bundle.grasp_name(row)}.yaml"
         written.append(dump_yaml(file, _trajectory(bundle, trajectory)))
-    return written + _hand(folder / "hand", hand_files) + _object(bundle, folder / "object")
+    return written + _write_hand(folder / "hand", hand_files) + _write_object(bundle, folder / "object")
 
 
 def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
@@ -36,7 +36,9 @@ def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
     names = [found.hand.joint_names[k] for k in bundle.commanded_joints]
 
     def point(posture: str, seconds: float, effort: Floats | None = None) -> dict[str, Any]:
-        return _point(postures[posture].joint_positions[row, bundle.commanded_joints], seconds, effort=effort)
+        return _trajectory_point(
+            postures[posture].joint_positions[row, bundle.commanded_joints], seconds, effort=effort
+        )
 
     # End of each motion: the last time of its phase.
     times = dict(zip(bundle.trajectories[row].phase, bundle.trajectories[row].time, strict=True))
@@ -44,7 +46,7 @@ def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
     press = stiffness * (postures["squeeze"].joint_positions[row] - postures["grasp"].joint_positions[row])
     closing, squeezing = times["close"] - times["shape"], times["squeeze"] - times["shape"]
     return {
-        "id": bundle.name(row),
+        "id": bundle.grasp_name(row),
         "pre_grasp_posture": _joint_trajectory(bundle, names, [point("pregrasp", times["shape"] - times["approach"])]),
         "grasp_posture": _joint_trajectory(
             bundle, names, [point("grasp", closing), point("squeeze", squeezing, press[bundle.commanded_joints])]
@@ -53,7 +55,7 @@ def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
             "header": _header(bundle),
             "pose": _pose(bundle.tool_in_frame(postures["grasp"].hand_pose[row])),
         },
-        "grasp_quality": numbers(found.quality["epsilon"][row])[0],
+        "grasp_quality": rounded_numbers(found.quality["epsilon"][row])[0],
         "pre_grasp_approach": _translation(bundle, row, "standoff", "arrival"),
         "post_grasp_retreat": _translation(bundle, row, "squeeze", "lift"),
         "post_place_retreat": _translation(bundle, row, "arrival", "standoff"),
@@ -67,14 +69,14 @@ def _header(bundle: Bundle) -> dict[str, Any]:
 
 
 def _pose(pose: Floats) -> dict[str, Any]:
-    x, y, z, qw, qx, qy, qz = numbers(pose)
+    x, y, z, qw, qx, qy, qz = rounded_numbers(pose)
     return {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
 
 
 def _translation(bundle: Bundle, row: int, start: str, end: str) -> dict[str, Any]:
     a, b = (bundle.tool_in_frame(bundle.found.postures[name].hand_pose[row])[:3] for name in (start, end))
     length = float(np.linalg.norm(b - a))
-    x, y, z = numbers((b - a) / length)
+    x, y, z = rounded_numbers((b - a) / length)
     return {
         "direction": {"header": _header(bundle), "vector": {"x": x, "y": y, "z": z}},
         "desired_distance": round(length, 9),
@@ -86,14 +88,14 @@ def _joint_trajectory(bundle: Bundle, names: list[str], points: list[dict[str, A
     return {"header": _header(bundle), "joint_names": names, "points": points}
 
 
-def _point(
+def _trajectory_point(
     positions: Floats, seconds: float, velocities: Floats | None = None, effort: Floats | None = None
 ) -> dict[str, Any]:
     return {
-        "positions": numbers(positions),
-        "velocities": [] if velocities is None else numbers(velocities),
+        "positions": rounded_numbers(positions),
+        "velocities": [] if velocities is None else rounded_numbers(velocities),
         "accelerations": [],
-        "effort": [] if effort is None else numbers(effort),
+        "effort": [] if effort is None else rounded_numbers(effort),
         "time_from_start": _duration(seconds),
     }
 
@@ -108,7 +110,7 @@ def _trajectory(bundle: Bundle, path: RobotTrajectory) -> dict[str, Any]:
     kept = [k for k, name in enumerate(path.joint_names) if name not in bundle.description.mimics]
     names = [path.joint_names[k] for k in kept]
     points = [
-        _point(joints[kept], time, rate[kept])
+        _trajectory_point(joints[kept], time, rate[kept])
         for joints, time, rate in zip(path.joints, path.time, path.velocity, strict=True)
     ]
     ways: list[dict[str, Any]] = []
@@ -120,16 +122,16 @@ def _trajectory(bundle: Bundle, path: RobotTrajectory) -> dict[str, Any]:
     return {"joint_trajectory": _joint_trajectory(bundle, names, points), "multi_dof_joint_trajectory": floating}
 
 
-def _hand(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
+def _write_hand(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
     for name, data in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(data)
     return [folder / name for name in files]
 
 
-def _object(bundle: Bundle, folder: Path) -> list[Path]:
+def _write_object(bundle: Bundle, folder: Path) -> list[Path]:
     obj, name = bundle.found.obj, plain_name(bundle.found.obj.name)
     folder.mkdir(parents=True, exist_ok=True)
     urdf, mesh = folder / f"{name}.urdf", folder / f"{name}.obj"
-    urdf.write_text(urdf_of(name, name, [mesh.name]))
-    return [mesh_file(obj, mesh), urdf]
+    urdf.write_text(urdf_text(name, name, [mesh.name]))
+    return [write_mesh(obj, mesh), urdf]

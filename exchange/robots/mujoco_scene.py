@@ -21,7 +21,7 @@ from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import compose
 from graspd.worker.hands.model import HandModel
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.model import MujocoOptions, Scene, build, scene_spec
+from graspd.worker.validation.model import MujocoOptions, Scene, build_scene, scene_spec
 
 #: Colours of the hand, the object, and everything else.
 _COLOURS: Final = ("0.36 0.45 0.58 1", "0.87 0.45 0.2 1", "0.75 0.75 0.72 1")
@@ -34,22 +34,24 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     around = ((), ()) if found.placed is None else (found.placed.supports, found.placed.neighbours)
     physics = MujocoOptions()
-    scene = build(found.hand, found.obj, pieces, physics, *around)
+    scene = build_scene(found.hand, found.obj, pieces, physics, *around)
     spec = scene_spec(found.hand, found.obj, pieces, physics, *around)
     spec.modelname = f"{plain_name(found.hand.name)} and {plain_name(found.obj.name)}"
     tree = ElementTree.fromstring(spec.to_xml())
     _restore_digits(tree, spec)
     for geom in tree.iter("geom"):
         number = scene.model.geom(geom.attrib["name"]).id
-        geom.set("user", element_text([scene.tip_geoms[number], scene.pressing[number]]))
-    site = {"name": "object_frame", "pos": element_text(-scene.centre), "size": "0.002", "group": "4"}
+        geom.set("user", number_text([scene.tip_geoms[number], scene.pressing[number]]))
+    site = {"name": "object_frame", "pos": number_text(-scene.centre), "size": "0.002", "group": "4"}
     SubElement(only_element(tree, ".//body[@name='object']"), "site", site)
     _set_physics(tree, found)
     neighbours = (f"neighbour{k}" for k in range(len(scene.neighbours)))
     add_appearance(tree, found, ("body0", "object", "supports", *neighbours))
     keys = SubElement(tree, "keyframe")
     for row, posture in product(range(len(found)), POSTURES):
-        SubElement(keys, "key", {"name": f"{bundle.name(row)}/{posture}", **_key_frame(found, scene, posture, row)})
+        SubElement(
+            keys, "key", {"name": f"{bundle.grasp_name(row)}/{posture}", **_key_frame(found, scene, posture, row)}
+        )
     rename(tree, _names(found.hand))
     ElementTree.indent(tree)
     file, script = folder / "scene.xml", folder / "replay.py"
@@ -69,7 +71,7 @@ def _restore_digits(tree: Element, spec: Any) -> None:
                     written = text.split()
                     exact = np.asarray(values, float)[: len(written)]
                     if np.allclose(exact, np.array(written, float), rtol=1e-5, atol=1e-9):
-                        element.set(key, element_text(exact))
+                        element.set(key, number_text(exact))
 
 
 def _set_physics(tree: Element, found: Executions) -> None:
@@ -97,12 +99,12 @@ def add_appearance(tree: Element, found: Executions, names: tuple[str, ...]) -> 
                 geom.set("rgba", colour)
     world, size = only_element(tree, "worldbody"), 2 * found.obj.radius + 0.3
     middle = found.object_pose[0, :3]
-    above = element_text(middle + np.array([0.5, -0.5, 2.0]))
+    above = number_text(middle + np.array([0.5, -0.5, 2.0]))
     world.insert(0, Element("light", pos=above, dir="-0.25 0.25 -1", diffuse="0.9 0.9 0.9"))
     visual = SubElement(tree, "visual")
     SubElement(visual, "headlight", ambient="0.4 0.4 0.4", diffuse="0.4 0.4 0.4")
     SubElement(visual, "global", azimuth="130", elevation="-25", offwidth="1280", offheight="960")
-    SubElement(tree, "statistic", center=element_text(middle), extent=element_text([size]))
+    SubElement(tree, "statistic", center=number_text(middle), extent=number_text([size]))
 
 
 def _key_frame(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, str]:
@@ -122,7 +124,7 @@ def _key_frame(found: Executions, scene: Scene, posture: str, row: int) -> dict[
         qpos[free.qpos : free.qpos + 7] = compose(rest, np.array([*free.centre, 1, 0, 0, 0]))
     control = scene.controls(command.joint_positions[row])
     values = {"qpos": qpos, "ctrl": control, "mpos": pose[:3], "mquat": pose[3:]}
-    return {name: element_text(value) for name, value in values.items()}
+    return {name: number_text(value) for name, value in values.items()}
 
 
 def _names(hand: HandModel) -> Mapping[str, str]:
@@ -148,7 +150,7 @@ def only_element(tree: Element, path: str) -> Element:
     return found
 
 
-def element_text(values: Any) -> str:
+def number_text(values: Any) -> str:
     """Return numbers in MJCF's format."""
     return " ".join(f"{float(value):.17g}" for value in np.ravel(values))
 
@@ -181,8 +183,8 @@ def _add_arm_keys(tree: Element, bundle: Bundle, carrier: Carrier) -> None:
             thing = found.lifted_object_pose[row] if posture == "lift" else found.object_pose[row]
             qpos = np.zeros(world.model.nq)
             qpos[world.arm_qpos], qpos[world.hand_qpos] = joints[:arms], joints[arms:]
-            at = {"mpos": element_text(thing[:3]), "mquat": element_text(thing[3:])}
-            SubElement(keys, "key", {"name": f"{bundle.name(row)}/{posture}", "qpos": element_text(qpos), **at})
+            at = {"mpos": number_text(thing[:3]), "mquat": number_text(thing[3:])}
+            SubElement(keys, "key", {"name": f"{bundle.grasp_name(row)}/{posture}", "qpos": number_text(qpos), **at})
 
 
 def _arm_names(bundle: Bundle, carrier: Carrier) -> dict[str, str]:

@@ -34,21 +34,21 @@ def write_glb(bundle: Bundle, folder: Path) -> list[Path]:
     moving, thing, standing = hand_meshes(found), object_mesh(found), support_meshes(found)
     for row in range(len(found)):
         document = Document()
-        nodes: list[dict[str, Any]] = [{"name": bundle.name(row), "rotation": _UPRIGHT}]
+        nodes: list[dict[str, Any]] = [{"name": bundle.grasp_name(row), "rotation": _UPRIGHT}]
         bodies = posed_bodies(found, "grasp", row)
         poses = [*(bodies[solid.body] for solid in moving), found.object_pose[row], *(None for _ in standing)]
         for solid, pose in zip([*moving, thing, *standing], poses, strict=True):
             primitive = document.add_triangles(solid.vertices, solid.faces, solid.normals, solid.colour)
-            nodes.append({"name": solid.name, "mesh": document.add_mesh([primitive]), **_placed(pose)})
-        nodes.append({"name": "tool_frame", **_placed(found.tool_pose("grasp")[row])})
+            nodes.append({"name": solid.name, "mesh": document.add_mesh([primitive]), **_node_transform(pose)})
+        nodes.append({"name": "tool_frame", **_node_transform(found.tool_pose("grasp")[row])})
         nodes[0]["children"] = list(range(1, len(nodes)))
         said = {"kind": "grasp", "row": int(found.rows[row]), "frame": found.frame, "tool_frame": found.tool.name}
-        written.append(folder / f"{bundle.name(row)}.glb")
+        written.append(folder / f"{bundle.grasp_name(row)}.glb")
         written[-1].write_bytes(document.to_bytes(nodes, said))
     return written
 
 
-def _placed(pose: Floats | None) -> dict[str, Any]:
+def _node_transform(pose: Floats | None) -> dict[str, Any]:
     if pose is None:
         return {}
     return {"translation": rounded_values(pose[:3]), "rotation": rounded_values(np.roll(pose[3:], -1))}
@@ -128,7 +128,7 @@ def write_usd(bundle: Bundle, folder: Path) -> list[Path]:
     found, written = bundle.found, []
     moving, thing, standing = hand_meshes(found), object_mesh(found), support_meshes(found)
     for row, trajectory in enumerate(bundle.trajectories):
-        written.append(folder / f"{bundle.name(row)}.usd")
+        written.append(folder / f"{bundle.grasp_name(row)}.usd")
         written[-1].unlink(missing_ok=True)
         stage = Usd.Stage.CreateNew(str(written[-1]))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -145,11 +145,11 @@ def write_usd(bundle: Bundle, folder: Path) -> list[Path]:
         bodies, times = body_poses(found.hand, trajectory.hand_pose, joints), RATE * trajectory.time
         at_grasp = posed_bodies(found, "grasp", row)
         for solid, name in zip(moving, prim_names([solid.name for solid in moving]), strict=True):
-            _add(stage, f"{root}/{name}", solid, at_grasp[solid.body], bodies[:, solid.body], times)
+            _add_mesh_prim(stage, f"{root}/{name}", solid, at_grasp[solid.body], bodies[:, solid.body], times)
         pose = found.object_pose[row]
-        _add(stage, f"/World/{object_prim}", thing, pose, _object_poses(found, row, trajectory), times)
+        _add_mesh_prim(stage, f"/World/{object_prim}", thing, pose, _object_poses(found, row, trajectory), times)
         for solid in standing:
-            _add(stage, f"/World/scene/{solid.name}", solid)
+            _add_mesh_prim(stage, f"/World/scene/{solid.name}", solid)
         stage.Save()
     return written
 
@@ -163,7 +163,7 @@ def _object_poses(found: Executions, row: int, trajectory: RobotTrajectory) -> F
     return poses
 
 
-def _add(
+def _add_mesh_prim(
     stage: Any, path: str, solid: Solid, pose: Floats | None = None, poses: Floats | None = None, times: Any = ()
 ) -> None:
     from pxr import Gf, UsdGeom, Vt

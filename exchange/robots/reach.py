@@ -21,11 +21,11 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines.mujoco_warnings import ARENA
-from graspd.worker.hands.collisions import resting_neighbours
+from graspd.worker.hands.collisions import collision_exempt_pairs
 from graspd.worker.hands.load import HandSource, body_model, files_from_path
 from graspd.worker.hands.model import HandModel, JointType
 from graspd.worker.hands.options import HandOptions
-from graspd.worker.hands.robot import FREE, MOVING, chain_to
+from graspd.worker.hands.robot import FREE, MOVING, joint_chain
 from graspd.worker.hands.tree import build_tree
 from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation.decomposition import ConvexPieces
@@ -53,7 +53,7 @@ def read_arm(path: str | pathlib.Path, mount: str, hand_pose: Floats) -> Arm:
     if mount not in robot.links:
         near = ", ".join(list(robot.links)[-6:])
         raise InputError(f"the arm {name} has no link {mount[:80]!r} to mount a hand on; its last links: {near}")
-    chain = {joint.name: joint.type for joint in chain_to(robot, mount)}
+    chain = {joint.name: joint.type for joint in joint_chain(robot, mount)}
     moving = {name for name, kind in chain.items() if kind in MOVING}
     if not moving:
         raise InputError(f"no joint of the arm {name} moves the link {mount!r}; name the link behind its last joint")
@@ -70,13 +70,13 @@ def read_arm(path: str | pathlib.Path, mount: str, hand_pose: Floats) -> Arm:
     )
     tree = build_tree(robot, chosen)
     model = body_model(replace(source, options=chosen), tree)
-    model = replace(model, neighbours=resting_neighbours(model))
+    model = replace(model, neighbours=collision_exempt_pairs(model))
     body, pose = tree.links[mount]
     return Arm(model, mount, body, np.asarray(pose, float), hand_pose)
 
 
 @dataclass(frozen=True)
-class Description:
+class HandDescription:
     """Links and joints of a hand."""
 
     links: Mapping[str, tuple[int, Floats]]
@@ -85,11 +85,11 @@ class Description:
     """Joints that the description couples to others; its readers move these joints themselves."""
 
 
-def read_description(files: Mapping[str, bytes], options: Mapping[str, Any] | None = None) -> Description:
+def read_description(files: Mapping[str, bytes], options: Mapping[str, Any] | None = None) -> HandDescription:
     """Return links and couplings of a hand; `files` and `options` as in `load_hand`."""
     source = HandSource.read(files, options)
     robot, tree = source.robot, build_tree(source.robot, source.options)
-    return Description(
+    return HandDescription(
         dict(tree.links), frozenset(name for name in tree.joint_names if robot.joints[name].mimic is not None)
     )
 
@@ -141,12 +141,12 @@ class ReachSearch:
         self._limits = [mink.ConfigurationLimit(self._model)]
         self._order = np.array([int(self._model.joint(f"arm{b}").qposadr[0]) for b in arm.model.joint_body], np.intp)
 
-    def all(self, wanted: int = 0) -> ReachResult:
+    def search_all(self, wanted: int = 0) -> ReachResult:
         """Search motions for all grasps in their order, or until `wanted` (if above 0) are executable."""
         reached = ReachResult()
         for row in range(len(self.found)):
             reached.candidates += 1
-            paths, reason = self.one(row)
+            paths, reason = self.search_row(row)
             if paths is None:
                 reached.refused[reason] += 1
             else:
@@ -156,7 +156,7 @@ class ReachSearch:
                 break
         return reached
 
-    def one(self, row: int) -> tuple[list[Path] | None, str]:
+    def search_row(self, row: int) -> tuple[list[Path] | None, str]:
         """Return the motions of one grasp, or None and the reason of the start that came farthest."""
         long, short = (straight_paths(self.found, row, points) for points in (LONG, SHORT))
         ways = [a if a.phase in _LONG_PHASES else b for a, b in zip(long, short, strict=True)]
@@ -235,7 +235,7 @@ class ReachSearch:
                 at = rest.copy()
                 if path.phase == "lift":
                     at[:3] += pose[:3] - path.hand_pose[0, :3]
-                if pair := self.world.touches(q, joints, at):
+                if pair := self.world.first_collision(q, joints, at):
                     return pair
         return ""
 
@@ -284,10 +284,10 @@ class ArmScene:
         self._exclude_permanent_contacts()
         self.model: Any = self.spec.compile()
         self.data: Any = mujoco.MjData(self.model)
-        self.arm_qpos = _addresses(self.model, arm.model, "arm")
-        self.hand_qpos = _addresses(self.model, hand, "hand")
+        self.arm_qpos = _joint_addresses(self.model, arm.model, "arm")
+        self.hand_qpos = _joint_addresses(self.model, hand, "hand")
 
-    def touches(self, arm_joints: Floats, hand_joints: Floats, object_pose: Floats) -> str:
+    def first_collision(self, arm_joints: Floats, hand_joints: Floats, object_pose: Floats) -> str:
         """Return a colliding pair, or an empty text if there is none.
         The posture is given by arm dofs (A,), hand joints (J,) and object pose (7,)."""
         self._put(self.model, self.data, arm_joints, hand_joints)
@@ -307,8 +307,8 @@ class ArmScene:
         return "an obstacle" if body == "world" else str(body)
 
     def _put(self, model: Any, data: Any, arm_joints: Floats, hand_joints: Floats) -> None:
-        data.qpos[_addresses(model, self.arm.model, "arm")] = self.arm.model.expand(arm_joints)
-        data.qpos[_addresses(model, self.hand, "hand")] = hand_joints
+        data.qpos[_joint_addresses(model, self.arm.model, "arm")] = self.arm.model.expand(arm_joints)
+        data.qpos[_joint_addresses(model, self.hand, "hand")] = hand_joints
 
     def _exclude_permanent_contacts(self) -> None:
         """Exclude body pairs in contact in nearly all random postures, as in MoveIt's setup."""
@@ -352,5 +352,5 @@ def _add_tree(spec: Any, root: Any, model: HandModel, prefix: str, contact: dict
     return bodies
 
 
-def _addresses(model: Any, tree: HandModel, prefix: str) -> NDArray[np.intp]:
+def _joint_addresses(model: Any, tree: HandModel, prefix: str) -> NDArray[np.intp]:
     return np.array([int(model.joint(f"{prefix}{b}").qposadr[0]) for b in tree.joint_body], np.intp)

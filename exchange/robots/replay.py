@@ -58,9 +58,9 @@ class Replay:
         self.reset(grasp, "pregrasp")
         start = self.data.qpos[self.at : self.at + 7].copy()
         mujoco.mj_forward(self.model, self.data)
-        if self.deepest() > MAX_DEPTH_M:
+        if self.deepest_penetration() > MAX_DEPTH_M:
             return "penetration"
-        if self.touches(grasp):
+        if self.hand_penetrates(grasp):
             return "contact on the approach"
         self.reset(grasp, "pregrasp")
         self.move(grasp, "pregrasp", "grasp")
@@ -144,14 +144,14 @@ class Replay:
             if self.watch:
                 self.watch(self)
 
-    def deepest(self) -> float:
-        return max((-contact.dist for contact in self.data.contact if self.hands(contact)), default=0.0)
+    def deepest_penetration(self) -> float:
+        return max((-contact.dist for contact in self.data.contact if self.is_hand_contact(contact)), default=0.0)
 
-    def hands(self, contact: Any) -> bool:
+    def is_hand_contact(self, contact: Any) -> bool:
         return bool(self.of_hand[contact.geom].any())
 
-    def touches(self, grasp: str) -> bool:
-        """Check whether the open hand penetrates anything deeper than `allowed` on its approach."""
+    def hand_penetrates(self, grasp: str) -> bool:
+        """Check whether the open hand penetrates anything deeper than `allowed_depth` on its approach."""
         for a, b, looks in (("standoff", "arrival", WAY_LOOKS), ("arrival", "pregrasp", CLOSING_LOOKS)):
             first, last = self.key(grasp, a), self.key(grasp, b)
             for look in range(looks):
@@ -167,11 +167,11 @@ class Replay:
                     self.watch(self)
                 for contact in self.data.contact:
                     ours = self.of_hand[contact.geom]
-                    if ours.any() and not ours.all() and contact.dist < -self.allowed(contact.geom):
+                    if ours.any() and not ours.all() and contact.dist < -self.allowed_depth(contact.geom):
                         return True
         return False
 
-    def allowed(self, pair: Any) -> float:
+    def allowed_depth(self, pair: Any) -> float:
         """Return the allowed depth of a pair of geoms in the approach [m]; some supports allow fingertips."""
         if self.of_object[pair].any():
             return OVERHANG_M

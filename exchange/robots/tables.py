@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from graspd.exchange.plan import plain_name, prim_name
-from graspd.exchange.robots.bundle import Bundle, dump_yaml, numbers
+from graspd.exchange.robots.bundle import Bundle, dump_yaml, rounded_numbers
 from graspd.exchange.robots.execution import POSTURES
 from graspd.service.model.transforms import POSE_PARTS, compose, invert
 
@@ -28,9 +28,9 @@ def write_tables(bundle: Bundle, folder: Path) -> list[Path]:
     of_object = (f"object_{part}" for part in POSE_PARTS)
     moving = ("grasp", "phase", "time_s", *POSE_PARTS, *of_trajectory)
     return [
-        _table(folder / "grasps.csv", ("grasp", *facts, *of_object), _grasps(bundle)),
-        _table(folder / "postures.csv", ("grasp", "posture", *POSE_PARTS, *joints), _postures(bundle)),
-        _table(folder / "trajectories.csv", moving, _trajectories(bundle)),
+        _write_csv(folder / "grasps.csv", ("grasp", *facts, *of_object), _grasps(bundle)),
+        _write_csv(folder / "postures.csv", ("grasp", "posture", *POSE_PARTS, *joints), _postures(bundle)),
+        _write_csv(folder / "trajectories.csv", moving, _trajectories(bundle)),
     ]
 
 
@@ -38,10 +38,10 @@ def _grasps(bundle: Bundle) -> Iterable[list[Any]]:
     found = bundle.found
     for row in range(len(found)):
         scene = "" if found.placed is None else int(found.placed.index[row])
-        place = [bundle.name(row), int(found.rows[row]), bundle.frame, found.tool.name, scene]
+        place = [bundle.grasp_name(row), int(found.rows[row]), bundle.frame, found.tool.name, scene]
         verdicts = [int(found.quality[name][row]) for name in ("valid", "success")]
-        pose = numbers(bundle.to_frame(found.object_pose[row]))
-        yield [*place, *verdicts, *numbers(found.quality["epsilon"][row]), *pose]
+        pose = rounded_numbers(bundle.to_frame(found.object_pose[row]))
+        yield [*place, *verdicts, *rounded_numbers(found.quality["epsilon"][row]), *pose]
 
 
 def _postures(bundle: Bundle) -> Iterable[list[Any]]:
@@ -49,17 +49,23 @@ def _postures(bundle: Bundle) -> Iterable[list[Any]]:
         for name in POSTURES:
             part = bundle.found.postures[name]
             pose = bundle.tool_in_frame(part.hand_pose[row])
-            yield [bundle.name(row), name, *numbers(pose), *numbers(part.joint_positions[row])]
+            yield [bundle.grasp_name(row), name, *rounded_numbers(pose), *rounded_numbers(part.joint_positions[row])]
 
 
 def _trajectories(bundle: Bundle) -> Iterable[list[Any]]:
     for row, path in enumerate(bundle.trajectories):
         poses = bundle.tool_in_frame(path.hand_pose)
         for phase, time, pose, joints in zip(path.phase, path.time, poses, path.joints, strict=True):
-            yield [bundle.name(row), phase, *numbers(time), *numbers(pose), *numbers(joints)]
+            yield [
+                bundle.grasp_name(row),
+                phase,
+                *rounded_numbers(time),
+                *rounded_numbers(pose),
+                *rounded_numbers(joints),
+            ]
 
 
-def _table(file: Path, heading: Sequence[str], rows: Iterable[list[Any]]) -> Path:
+def _write_csv(file: Path, heading: Sequence[str], rows: Iterable[list[Any]]) -> Path:
     with file.open("w", newline="", encoding="utf-8") as opened:
         writer = csv.writer(opened)
         writer.writerow(heading)
@@ -82,7 +88,7 @@ def write_isaac(bundle: Bundle, folder: Path) -> list[Path]:
         "gripper_frame_link": tool,
         "object_frame": thing,
         "gripper_frame": tool,
-        "grasps": {bundle.name(row): _grasp(bundle, row) for row in range(len(found))},
+        "grasps": {bundle.grasp_name(row): _grasp(bundle, row) for row in range(len(found))},
     }
     file = folder / f"{plain_name(found.hand.name)}_{plain_name(found.obj.name)}.yaml"
     return [dump_yaml(file, document)]
@@ -92,11 +98,11 @@ def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
     found = bundle.found
 
     def pose(posture: str) -> dict[str, Any]:
-        x, y, z, w, *xyz = numbers(compose(invert(found.object_pose[row]), found.tool_pose(posture)[row]))
+        x, y, z, w, *xyz = rounded_numbers(compose(invert(found.object_pose[row]), found.tool_pose(posture)[row]))
         return {"position": [x, y, z], "orientation": {"w": w, "xyz": xyz}}
 
     def joints(posture: str) -> dict[str, float]:
-        values = numbers(found.postures[posture].joint_positions[row])
+        values = rounded_numbers(found.postures[posture].joint_positions[row])
         return {found.hand.joint_names[k]: values[k] for k in bundle.commanded_joints}
 
     return {
@@ -110,6 +116,6 @@ def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
             "standoff": pose("standoff"),
             "pregrasp": pose("pregrasp"),
             "lift": pose("lift"),
-            "epsilon": numbers(np.asarray(found.quality["epsilon"][row]))[0],
+            "epsilon": rounded_numbers(np.asarray(found.quality["epsilon"][row]))[0],
         },
     }

@@ -10,7 +10,7 @@ import typer
 
 from graspd.api.access.keys import KeyFile, KeyLimits, ProjectLimits, Scope
 from graspd.api.formatting import minute
-from graspd.client.client import path_of
+from graspd.client.client import request_path
 from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, report_deletion
 from graspd.service.cli import CommandGroup, JsonFlag, load_settings, print_result
 from graspd.service.model.errors import InputError
@@ -47,7 +47,7 @@ def add_key(
         grasps_in_flight=grasps_in_flight,
         jobs_per_day=jobs_per_day,
     )
-    lifetime = duration(expires) if expires else None
+    lifetime = parse_duration(expires) if expires else None
     token = _key_file().add(name, scope, lifetime=lifetime, limits=limits, project=project)
     _show_token(name, scope, token, json=json)
 
@@ -61,7 +61,7 @@ def rotate_key(
 ) -> None:
     """Replace the secret of a key and show it once; scope, project and limits do not change."""
     keys = _key_file()
-    token = keys.rotate(name, grace=duration(grace), lifetime=duration(expires) if expires else None)
+    token = keys.rotate(name, grace=parse_duration(grace), lifetime=parse_duration(expires) if expires else None)
     _show_token(name, next(key.scope for key in reversed(keys.list()) if key.name == name), token, json=json)
 
 
@@ -83,7 +83,7 @@ def limit_key(
     )
     if not given:
         raise InputError("give at least one limit, such as --jobs-per-day 100")
-    limits = _key_file().limit(name, KeyLimits(**given))
+    limits = _key_file().set_limits(name, KeyLimits(**given))
     document = {"name": name, "limits": limits.model_dump(exclude_none=True)}
     print_result(document, f"limits of {name}: {_key_limits(limits)}", json=json)
 
@@ -112,7 +112,7 @@ def revoke_key(name: NameArgument, json: JsonFlag = False) -> None:
     print_result({"name": name, "revoked": True}, f"the key {name} is revoked", json=json)
 
 
-def duration(text: str) -> timedelta:
+def parse_duration(text: str) -> timedelta:
     """Parse a time such as 90d, 12h, 30m or 45s; raise InputError for any other text."""
     match = re.fullmatch(r"(\d{1,6})([smhd])", text.strip())
     if match is None:
@@ -218,7 +218,7 @@ def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
 def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
     """List deliveries of a webhook, newest first."""
     with open_client(url) as client:
-        found = client.send("GET", path_of("webhooks", webhook, "deliveries")).json()
+        found = client.send("GET", request_path("webhooks", webhook, "deliveries")).json()
     rows = []
     for one in found:
         what = f"{one['kind']} {one['subject'][:12] if one['kind'] == 'job' else one['subject']}"
@@ -232,5 +232,5 @@ def delete_webhook(webhook: IdArgument, yes: YesOption = False, url: UrlOption =
     """Delete a webhook and its secret."""
     with open_client(url) as client:
         confirm(f"Delete the webhook {webhook} and its secret for good?", f"the webhook {webhook}", yes=yes)
-        client.delete(path_of("webhooks", webhook))
+        client.delete(request_path("webhooks", webhook))
     report_deletion("webhook", webhook, json=json)

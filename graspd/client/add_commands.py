@@ -20,20 +20,20 @@ from graspd.service.command_options import with_options
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.asset_options import (
-    HandWords,
+    HandCommandOptions,
     LicenceOption,
+    ObjectSizeOptions,
     SourceOption,
-    SweptOptions,
     hand_options,
+    parse_sizes,
     provenance,
-    sizes_of,
 )
 from graspd.service.store.asset_summary import verdict_line
 from graspd.service.store.assets import pack
-from graspd.service.store.descriptions import json_object
-from graspd.service.store.hand_files import SUFFIXES, files_of_hand, hand_name
+from graspd.service.store.descriptions import parse_json_object
+from graspd.service.store.hand_files import SUFFIXES, find_hand_files, hand_name
 from graspd.service.store.object_sets import SUFFIXES as MESHES
-from graspd.service.store.object_sets import Objects, files_of_set
+from graspd.service.store.object_sets import Objects, find_set_objects
 
 NameOption = Annotated[str | None, typer.Option("--name", help="Name of the asset; default: the file's name.")]
 SharedOption = Annotated[bool, typer.Option("--shared", help="Share it with all projects, not only the key's project.")]
@@ -42,7 +42,7 @@ _CHECK_S: Final = 120.0
 _SELF_TEST_S: Final = 900.0
 
 
-@with_options(HandWords, "asset")
+@with_options(HandCommandOptions, "asset")
 def add_hand(
     file: Annotated[Path, typer.Argument(help="URDF, xacro or MJCF file with its meshes, its folder, or a ZIP of it.")],
     name: NameOption = None,
@@ -63,7 +63,7 @@ def add_hand(
         _add(AssetKind.HAND, upload, name, said, self_test=self_test, shared=shared, wait=wait, url=url, json=json)
 
 
-@with_options(SweptOptions, "asset")
+@with_options(ObjectSizeOptions, "asset")
 def add_object(
     file: Annotated[Path, typer.Argument(help="Mesh, ZIP with one mesh, or folder or ZIP of many objects.")],
     name: NameOption = None,
@@ -77,12 +77,12 @@ def add_object(
     json: JsonFlag = False,
 ) -> None:
     """Upload an object or a set of objects, wait for the check, and report repairs."""
-    sizes = sizes_of(options.pop("scale_to", None))
+    sizes = parse_sizes(options.pop("scale_to", None))
     options |= provenance(licence, source) | ({"scale_to": sizes[0]} if len(sizes) == 1 else {})
     if len(sizes) > 1:
-        swept = scale_objects(files_of_set(file) or single_object(file, name), sizes)
+        swept = scale_objects(find_set_objects(file) or single_object(file, name), sizes)
         add = partial(add_set, swept, name=name or name_of_set(file), prefix=None)
-    elif files := files_of_set(file):
+    elif files := find_set_objects(file):
         add = partial(add_set, files, name=name or name_of_set(file), prefix=name)
     else:
         add = partial(_add, AssetKind.OBJECT, file, name)
@@ -118,7 +118,7 @@ def _add(
         name = name or name_of_upload(file.name)
         asset = client.upload(kind, file, name=name, options=options, self_test=self_test, shared=shared)
         if wait:
-            asset = client.wait_checked(kind, asset.digest, timeout_s=_SELF_TEST_S if self_test else _CHECK_S)
+            asset = client.wait_for_check(kind, asset.digest, timeout_s=_SELF_TEST_S if self_test else _CHECK_S)
     show_asset(asset.model_dump(mode="json"), json=json)
     if asset.verdict == "refuse":
         raise InputError(f"refused: {asset.message}")
@@ -128,7 +128,7 @@ def _add(
 def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
     """Yield `path` or a temporary ZIP of all files of the hand, and the main file in this ZIP."""
     alone = not path.is_dir() and (path.suffix.lower() not in SUFFIXES or not path.is_file())
-    files, main = ({}, "") if alone else files_of_hand(path)
+    files, main = ({}, "") if alone else find_hand_files(path)
     if len(files) <= 1 and not path.is_dir():
         yield path, ""
         return
@@ -151,7 +151,7 @@ def scale_objects(objects: Objects, sizes: Sequence[float]) -> Objects:
     made: Objects = {}
     for name, files in objects.items():
         mesh = next(file for file in files if file != "asset.json")
-        described = {"file": mesh, **json_object(files.get("asset.json", b"{}"), "asset.json")}
+        described = {"file": mesh, **parse_json_object(files.get("asset.json", b"{}"), "asset.json")}
         for size in sizes:
             text = json.dumps(described | {"scale_to": size})
             made[f"{name}-{1000 * size:g}mm"] = files | {"asset.json": text.encode()}
@@ -209,7 +209,7 @@ def upload_set(
     ]
     for one in told:
         if wait and one["verdict"] is None:
-            asset = client.wait_checked(AssetKind.OBJECT, one["digest"])
+            asset = client.wait_for_check(AssetKind.OBJECT, one["digest"])
             one.update(verdict=asset.verdict, message=asset.message or "", repairs=asset.repairs)
         if say is not None:
             say(verdict_line(one))

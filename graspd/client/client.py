@@ -61,31 +61,33 @@ class Client(AbstractContextManager["Client"]):
 
     def submit(self, request: JobRequest) -> JobDetail:
         """Submit a job; an identical request returns the same job."""
-        return self._document(JobDetail, "POST", "/v1/jobs", json=request.model_dump(mode="json"))
+        return self._request_model(JobDetail, "POST", "/v1/jobs", json=request.model_dump(mode="json"))
 
     def job(self, job_id: str) -> JobDetail:
-        return self._document(JobDetail, "GET", path_of("jobs", job_id))
+        return self._request_model(JobDetail, "GET", request_path("jobs", job_id))
 
     def jobs(self, *, state: State | None = None, prefix: str = "", limit: int = 50) -> Page[Job]:
         """Return the newest jobs whose ids begin with `prefix`, at most `limit`."""
-        return self._document(Page[Job], "GET", "/v1/jobs", params={"state": state, "prefix": prefix, "limit": limit})
+        return self._request_model(
+            Page[Job], "GET", "/v1/jobs", params={"state": state, "prefix": prefix, "limit": limit}
+        )
 
     def cancel(self, job_id: str) -> JobDetail:
-        return self._document(JobDetail, "POST", path_of("jobs", job_id, "cancel"))
+        return self._request_model(JobDetail, "POST", request_path("jobs", job_id, "cancel"))
 
     def delete(self, path: str, **params: Any) -> None:
         """Delete the resource at an address: `/v1/jobs/ID`, `/v1/objects/NAME`."""
         self.send("DELETE", path, params=params)
 
     def retry(self, job_id: str) -> JobDetail:
-        return self._document(JobDetail, "POST", path_of("jobs", job_id, "retry"))
+        return self._request_model(JobDetail, "POST", request_path("jobs", job_id, "retry"))
 
     def assets(self, kind: AssetKind, *, refused: bool = False) -> Iterator[AssetView]:
         """Yield all hands, objects or networks; refused ones only on request."""
         return self._pages(AssetView, f"/v1/{kind.value}s", refused=refused)
 
     def asset(self, kind: AssetKind, name: str) -> AssetView:
-        return self._document(AssetView, "GET", path_of(f"{kind.value}s", name))
+        return self._request_model(AssetView, "GET", request_path(f"{kind.value}s", name))
 
     def upload(
         self,
@@ -103,11 +105,11 @@ class Client(AbstractContextManager["Client"]):
         try:
             with path.open("rb") as file:
                 sent = {"file": (path.name, file)}
-                return self._document(AssetView, "POST", f"/v1/{kind.value}s", files=sent, data=fields)
+                return self._request_model(AssetView, "POST", f"/v1/{kind.value}s", files=sent, data=fields)
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}") from None
 
-    def wait_checked(self, kind: AssetKind, digest: str, *, timeout_s: float = 120.0) -> AssetView:
+    def wait_for_check(self, kind: AssetKind, digest: str, *, timeout_s: float = 120.0) -> AssetView:
         """Return an uploaded asset after its check; raise UnavailableError after `timeout_s`."""
         deadline = time.monotonic() + timeout_s
         while (asset := self.asset(kind, digest)).verdict is None:
@@ -144,7 +146,7 @@ class Client(AbstractContextManager["Client"]):
         """Yield a job at each change until it ends; reconnect if the connection breaks."""
         while True:
             try:
-                for event, data in self._events(path_of("jobs", job_id, "events")):
+                for event, data in self._events(request_path("jobs", job_id, "events")):
                     if event in ("progress", "end"):
                         yield Job.model_validate(data)
                     if event == "end":
@@ -161,33 +163,33 @@ class Client(AbstractContextManager["Client"]):
         return self.job(job_id)
 
     def create_dataset(self, request: DatasetRequest) -> DatasetView:
-        return self._document(DatasetView, "POST", "/v1/datasets", json=_matrix_body(request))
+        return self._request_model(DatasetView, "POST", "/v1/datasets", json=_matrix_body(request))
 
     def estimate(self, matrix: Matrix) -> Estimate:
         body = {name: value for name, value in _matrix_body(matrix).items() if name in Matrix.model_fields}
-        return self._document(Estimate, "POST", "/v1/datasets/estimate", json=body)
+        return self._request_model(Estimate, "POST", "/v1/datasets/estimate", json=body)
 
     def datasets(self, *, limit: int = 50) -> Page[DatasetView]:
-        return self._document(Page[DatasetView], "GET", "/v1/datasets", params={"limit": limit})
+        return self._request_model(Page[DatasetView], "GET", "/v1/datasets", params={"limit": limit})
 
     def dataset(self, name: str) -> DatasetView:
-        return self._document(DatasetView, "GET", path_of("datasets", name))
+        return self._request_model(DatasetView, "GET", request_path("datasets", name))
 
     def cells(self, name: str, *, state: State | None = None) -> Iterator[CellView]:
         """Yield all cells of a dataset, or those in a state."""
-        return self._pages(CellView, path_of("datasets", name, "cells"), state=state)
+        return self._pages(CellView, request_path("datasets", name, "cells"), state=state)
 
     def cancel_dataset(self, name: str) -> DatasetView:
-        return self._document(DatasetView, "POST", path_of("datasets", name, "cancel"))
+        return self._request_model(DatasetView, "POST", request_path("datasets", name, "cancel"))
 
     def retry_dataset(self, name: str) -> DatasetView:
-        return self._document(DatasetView, "POST", path_of("datasets", name, "retry"))
+        return self._request_model(DatasetView, "POST", request_path("datasets", name, "retry"))
 
     def take_snapshot(self, name: str) -> SnapshotView:
-        return self._document(SnapshotView, "POST", path_of("datasets", name, "snapshots"))
+        return self._request_model(SnapshotView, "POST", request_path("datasets", name, "snapshots"))
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
-        return self._document(Snapshot, "GET", path_of("datasets", name, "snapshots", digest))
+        return self._request_model(Snapshot, "GET", request_path("datasets", name, "snapshots", digest))
 
     def watch_dataset(self, name: str) -> Iterator[DatasetView]:
         """Yield a dataset every second until it ends."""
@@ -198,7 +200,7 @@ class Client(AbstractContextManager["Client"]):
 
     def add_object_set(self, name: str, objects: Iterable[str]) -> ObjectSetView:
         body = {"name": name, "objects": list(objects)}
-        return self._document(ObjectSetView, "POST", "/v1/object-sets", json=body)
+        return self._request_model(ObjectSetView, "POST", "/v1/object-sets", json=body)
 
     def object_sets(self) -> list[ObjectSetView]:
         return TypeAdapter(list[ObjectSetView]).validate_json(self.send("GET", "/v1/object-sets").content)
@@ -206,13 +208,13 @@ class Client(AbstractContextManager["Client"]):
     def _pages(self, kind: type[View], path: str, **params: Any) -> Iterator[View]:
         params |= {"limit": _PAGE, "cursor": None}
         while True:
-            page: Page[Any] = self._document(Page[kind], "GET", path, params=params)  # type: ignore[valid-type]
+            page: Page[Any] = self._request_model(Page[kind], "GET", path, params=params)  # type: ignore[valid-type]
             yield from page.items
             params["cursor"] = page.next
             if page.next is None:
                 return
 
-    def _document(self, kind: type[View], method: str, path: str, **options: Any) -> View:
+    def _request_model(self, kind: type[View], method: str, path: str, **options: Any) -> View:
         return kind.model_validate_json(self.send(method, path, **options).content)
 
     def _is_reachable_again(self) -> bool:
@@ -228,7 +230,7 @@ class Client(AbstractContextManager["Client"]):
     def _events(self, path: str) -> Iterator[tuple[str, Any]]:
         with _convert_errors(self.url), self._http.stream("GET", path, timeout=_STREAM_TIMEOUT) as answer:
             _raise_for(answer)
-            yield from events_of(answer)
+            yield from parse_events(answer)
 
     def send(self, method: str, path: str, *, params: dict[str, Any] | None = None, **options: Any) -> httpx.Response:
         """Send a request and return the response; raise a problem document as an exception."""
@@ -244,7 +246,7 @@ class Client(AbstractContextManager["Client"]):
         return answer
 
 
-def path_of(*parts: str) -> str:
+def request_path(*parts: str) -> str:
     """Build an address of the API from its parts, with escaped names: `/v1/tags/good%20ones/remove`."""
     return "/v1/" + "/".join(quote(part, safe="") for part in parts)
 
@@ -273,7 +275,7 @@ def _authorization(key: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {key}"}
 
 
-def events_of(answer: httpx.Response) -> Iterator[tuple[str, Any]]:
+def parse_events(answer: httpx.Response) -> Iterator[tuple[str, Any]]:
     for event in EventSource(answer).iter_sse():
         if event.data:
             yield event.event, event.json()

@@ -13,7 +13,7 @@ from graspd.api.formatting import count, minute, percent, size
 from graspd.api.uploads import MAIN_SUFFIXES, name_of_upload
 from graspd.client import access_commands, tag_commands
 from graspd.client.add_commands import add_hand, add_network, add_object
-from graspd.client.client import Client, path_of
+from graspd.client.client import Client, request_path
 from graspd.client.reports import (
     UrlOption,
     YesOption,
@@ -27,10 +27,10 @@ from graspd.client.reports import (
     watch,
 )
 from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
-from graspd.service.command_options import parse_pairs, parsed_options, with_options
+from graspd.service.command_options import parse_pairs, validate_options, with_options
 from graspd.service.model.domain import NETWORK_METHODS, JobOptions, JobRequest
 from graspd.service.model.errors import InputError
-from graspd.service.model.scene_spec import scene_option
+from graspd.service.model.scene_spec import parse_scene_option
 from graspd.service.model.states import AssetKind, State
 from graspd.service.store.asset_summary import hand_line, self_test_line
 
@@ -59,10 +59,10 @@ def submit(
             "hand": _asset_name(client, AssetKind.HAND, hand),
             "object": object_name(object),
             "options": own,
-            "scene": scene_option(options.get("scene", "free"), named=object_name),
+            "scene": parse_scene_option(options.get("scene", "free"), named=object_name),
             "neighbours": [object_name(one) for one in options.get("neighbours", ())],
         }
-        request = parsed_options(JobRequest, options)
+        request = validate_options(JobRequest, options)
         job = client.submit(request)
         if wait:
             job = watch(client, job.id)
@@ -112,7 +112,7 @@ def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, j
         job = client.job(_full_id(client, job_id))
         asked = f"Delete job {job.id[:12]}, {job.hand} on {job.object}, with its {count(job.grasps)} grasps?"
         confirm(asked, f"job {job.id[:12]}", yes=yes)
-        client.delete(path_of("jobs", job.id))
+        client.delete(request_path("jobs", job.id))
     report_deletion("job", job.id, json=json, undo=f"graspd restore {job.id[:12]}")
 
 
@@ -208,7 +208,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         with open_client(url) as client:
             client.asset(kind, name)
             confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
-            client.delete(path_of(f"{kind.value}s", name))
+            client.delete(request_path(f"{kind.value}s", name))
         report_deletion(kind.value, name, json=json, undo=f"graspd {kind.value}s restore {name}")
 
     @group.command(
@@ -261,7 +261,7 @@ def _asset_name(client: Client, kind: AssetKind, value: str) -> str:
     if not path.is_file():
         raise InputError(f"there is no file {value}; give a path that exists, or the name of a known {kind.value}")
     asset = client.upload(kind, path, name=name_of_upload(path.name))
-    if not asset.builtin and (asset := client.wait_checked(kind, asset.digest)).verdict == "refuse":
+    if not asset.builtin and (asset := client.wait_for_check(kind, asset.digest)).verdict == "refuse":
         raise InputError(f"refused: {asset.message}")
     return asset.name
 

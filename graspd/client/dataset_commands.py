@@ -17,7 +17,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from graspd.api.formatting import count, minute, percent, size
 from graspd.client.add_commands import name_of_set, upload_set
-from graspd.client.client import Client, path_of
+from graspd.client.client import Client, request_path
 from graspd.client.reports import (
     UrlOption,
     YesOption,
@@ -32,17 +32,17 @@ from graspd.client.reports import (
     watch_dataset,
 )
 from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json, print_result
-from graspd.service.command_options import parse_pairs, parsed_options, with_options
+from graspd.service.command_options import parse_pairs, validate_options, with_options
 from graspd.service.index.views import DatasetView
 from graspd.service.model.base import Name, error_text
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError, did_you_mean
 from graspd.service.model.options import validate
-from graspd.service.model.scene_spec import check_object_name, scene_option
+from graspd.service.model.scene_spec import check_object_name, parse_scene_option
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.export import export_shards
 from graspd.service.pipeline.datasets.spec import DatasetRequest, Estimate, Matrix
-from graspd.service.store.object_sets import Objects, files_of_set
+from graspd.service.store.object_sets import Objects, find_set_objects
 
 SpecOption = Annotated[Path | None, typer.Option("--spec", help="TOML or JSON file; options take precedence.")]
 
@@ -65,7 +65,7 @@ class Spec(JobOptions):
 
 
 @dataclass(frozen=True)
-class PlanRequest:
+class DatasetPlan:
     name: str
     hands: str
     objects: str
@@ -79,15 +79,15 @@ class PlanRequest:
         return matrix | {"grasps": math.ceil(self.total / (len(matrix["hands"]) * objects))}
 
 
-def plan_request(
+def dataset_plan(
     spec: Path | None, *, name: str | None, hands: str | None, objects: str | None, options: dict[str, Any]
-) -> PlanRequest:
+) -> DatasetPlan:
     """Combine spec and options; options take precedence. The name is empty if neither has one."""
     given = dict(options)
     if "options" in given:
         given["options"] = parse_pairs(given["options"])
     if "scene" in given:
-        given["scene"] = scene_option(given["scene"])
+        given["scene"] = parse_scene_option(given["scene"])
     if "neighbours" in given:
         given["neighbours"] = [check_object_name(one) for one in given["neighbours"]]
     said = read_spec(spec) if spec is not None else {}
@@ -100,7 +100,7 @@ def plan_request(
         if not found:
             raise InputError(f"give the {what}: --{what}, or {what} in the file of --spec")
     rest = {key: value for key, value in said.items() if key not in ("name", "hands", "objects")}
-    return PlanRequest(found_name, found_hands, found_objects, {**rest, **given}, total)
+    return DatasetPlan(found_name, found_hands, found_objects, {**rest, **given}, total)
 
 
 def read_spec(file: Path) -> dict[str, Any]:
@@ -116,7 +116,7 @@ def read_spec(file: Path) -> dict[str, Any]:
         raise InputError(f"{file} must contain the keys of a dataset: hands, objects, grasps, ...")
     try:
         if isinstance(found.get("scene"), str):
-            found["scene"] = scene_option(found["scene"], beside=file.parent)
+            found["scene"] = parse_scene_option(found["scene"], beside=file.parent)
         if isinstance(beside := found.get("neighbours"), list):
             found["neighbours"] = [check_object_name(one) if isinstance(one, str) else one for one in beside]
         spec = validate(Spec, found)
@@ -159,12 +159,12 @@ def create(
 ) -> None:
     """Make a dataset with a job for each hand and object. The same command continues it later."""
     console = plain_console(stderr=json)
-    asked = plan_request(spec, name=name, hands=hands, objects=objects, options=options)
+    asked = dataset_plan(spec, name=name, hands=hands, objects=objects, options=options)
     if not asked.name:
         raise InputError("give a name: graspd datasets create NAME, or name in the file of --spec")
     with open_client(url) as client:
         files, matrix = _matrix(client, asked)
-        request = parsed_options(DatasetRequest, {"name": asked.name, **matrix})
+        request = validate_options(DatasetRequest, {"name": asked.name, **matrix})
         found = _estimate(client, matrix, files)
         print_estimate(found, console)
         if dry_run:
@@ -178,7 +178,7 @@ def create(
         if files is not None:
             refused = _upload(client, files, name_of_set(Path(asked.objects)), console)
             matrix = asked.matrix_per_cell(matrix, len(files) - len(refused))
-            request = parsed_options(DatasetRequest, {"name": asked.name, **matrix, "objects": []})
+            request = validate_options(DatasetRequest, {"name": asked.name, **matrix, "objects": []})
         dataset = client.create_dataset(request)
         if wait:
             dataset = watch_dataset(client, asked.name, plain_console(stderr=True))
@@ -203,7 +203,7 @@ def estimate(
     options: dict[str, Any],
 ) -> None:
     """Estimate the cost of a dataset: storage, and time and traffic for 1, 8 and 64 workers."""
-    asked = plan_request(spec, name=None, hands=hands, objects=objects, options=options)
+    asked = dataset_plan(spec, name=None, hands=hands, objects=objects, options=options)
     with open_client(url) as client:
         files, matrix = _matrix(client, asked)
         found = _estimate(client, matrix, files)
@@ -225,7 +225,7 @@ def list_datasets(
     document = {"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next}
     rows = []
     for one in page.items:
-        made = f"{count(one.counted)} {one.options.standing} of {count(one.asked)}"
+        made = f"{count(one.counted_grasps)} {one.options.displayed_status} of {count(one.asked)}"
         last = (percent(one.progress), made, size(one.size_bytes), minute(one.created))
         rows.append((one.name, one.state, count(one.cells), *last))
     names = ("dataset", "state", "cells", "progress", "grasps", "size", "created")
@@ -271,7 +271,7 @@ def delete(
         goes = f"{count(found.cells)} cell{'s' * (found.cells != 1)}, {count(found.grasps)} grasps"
         goes += f" ({size(found.size_bytes)})" + ", its snapshots" * with_snapshots
         confirm(f"Delete dataset {name} with {goes}?", f"dataset {name}", yes=yes)
-        client.delete(path_of("datasets", name), with_snapshots=with_snapshots)
+        client.delete(request_path("datasets", name), with_snapshots=with_snapshots)
     report_deletion("dataset", name, json=json, undo=f"graspd datasets restore {name}")
 
 
@@ -322,7 +322,7 @@ def export(
             fetched = export_shards(
                 taken,
                 out,
-                lambda shard: client.fetch(path_of("shards", shard.id, "file")),
+                lambda shard: client.fetch(request_path("shards", shard.id, "file")),
                 lambda done, files, fetched: progress.update(bar, completed=fetched, files=f"{done}/{files}"),
             )
     told = {"dataset": name, "snapshot": taken.digest, "out": str(out), "files": len(taken.shards), "fetched": fetched}
@@ -330,14 +330,14 @@ def export(
     print_result({**told, "bytes": taken.size_bytes, "complete": taken.complete}, line, json=json)
 
 
-def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[str, Any]]:
+def _matrix(client: Client, asked: DatasetPlan) -> tuple[Objects | None, dict[str, Any]]:
     objects = asked.objects
     names = [word.strip() for word in objects.split(",") if word.strip()]
     matrix: dict[str, Any] = {"hands": [w.strip() for w in asked.hands.split(",") if w.strip()], **asked.options}
     known = {found.name: found.objects for found in client.object_sets()}
     path = Path(objects)
     # A bare name means the known set, even if a folder of that name exists; ./NAME is the folder.
-    if objects not in known and (files := files_of_set(path)):
+    if objects not in known and (files := find_set_objects(path)):
         matrix |= {"objects": sorted(files), "sets": [name_of_set(path)]}
         return files, asked.matrix_per_cell(matrix, len(files))
     if objects not in known and path.is_file():
@@ -353,7 +353,7 @@ def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[st
 def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> Estimate:
     """Return the cost; raise InputError for unknown names, except names of files to upload."""
     asked = matrix | {"sets": []} if files is not None else matrix
-    found = client.estimate(parsed_options(Matrix, asked))
+    found = client.estimate(validate_options(Matrix, asked))
     if unknown := [name for name in found.unknown if name not in (files or {})]:
         known = [one.name for kind in (AssetKind.HAND, AssetKind.OBJECT) for one in client.assets(kind)]
         fix = f"`graspd hands list` and `graspd objects list` show the known ones{did_you_mean(unknown[0], known)}"

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from graspd.api.formatting import count, duration, metric, percent, size, valid_yield, worker_time
 from graspd.api.models import Job, JobDetail, StageStatus
-from graspd.client.client import Client, path_of
+from graspd.client.client import Client, request_path
 from graspd.service.cli import load_settings, plain_console, plain_table, print_json, print_result
 from graspd.service.index.views import CellView, DatasetView, Validated
 from graspd.service.model.domain import JobOptions
@@ -58,7 +58,7 @@ def report_deletion(what: str, name: str, *, json: bool, undo: str = "") -> None
 
 def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
     with open_client(url) as client:
-        found = client.send("POST", path_of(f"{what}s", name, "restore")).json()
+        found = client.send("POST", request_path(f"{what}s", name, "restore")).json()
     print_result({"restored": found["id"], "kind": what}, f"{what} {name} is restored", json=json)
 
 
@@ -218,13 +218,13 @@ class JobDisplay:
             if stage.state is not State.QUEUED:
                 self._started.setdefault(stage.stage, time.monotonic())
             if self._console.is_terminal:
-                self._draw(stage, job)
+                self._update_bar(stage, job)
             else:
                 self._print_state(stage, job)
 
-    def _draw(self, stage: StageStatus, job: Job) -> None:
+    def _update_bar(self, stage: StageStatus, job: Job) -> None:
         if stage.stage not in self._bars:
-            made, unit = _size_of(stage, job)
+            made, unit = _stage_items(stage, job)
             self._bars[stage.stage] = self._progress.add_task(
                 stage.stage.value,
                 total=stage.tasks,
@@ -248,7 +248,7 @@ class JobDisplay:
         self._console.print(self._line(stage, job, now))
 
     def _line(self, stage: StageStatus, job: Job, now: float) -> str:
-        elapsed, (made, unit) = now - self._started.get(stage.stage, now), _size_of(stage, job)
+        elapsed, (made, unit) = now - self._started.get(stage.stage, now), _stage_items(stage, job)
         words = f"{stage.stage.value:<11} {stage.state.value:<10} {100 * stage.progress:3.0f} %"
         if stage.state is State.SUCCEEDED:
             seconds = stage.seconds or elapsed
@@ -259,7 +259,7 @@ class JobDisplay:
         return words
 
 
-def _size_of(stage: StageStatus, job: Job) -> tuple[int, str]:
+def _stage_items(stage: StageStatus, job: Job) -> tuple[int, str]:
     """Return the number of items that a stage makes, and their name."""
     return (job.requested, "grasps") if stage.stage is Stage.SYNTHESIZE else (stage.tasks, "tasks")
 
@@ -304,9 +304,10 @@ def print_dataset(dataset: DatasetView, console: Console) -> None:
     left = f", {duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
     console.print(f"{dataset.name}  {dataset.state.value}  {percent(dataset.progress)}{left}")
     console.print(f"cells: {states}")
-    candidates = f" of {count(dataset.candidates)} candidates ({_yield(dataset)})" if dataset.candidates else ""
+    candidates = f" of {count(dataset.candidates)} candidates ({_yield_text(dataset)})" if dataset.candidates else ""
     console.print(
-        f"grasps: {count(dataset.counted)} {dataset.options.standing}{candidates}, {count(dataset.asked)} requested; "
+        f"grasps: {count(dataset.counted_grasps)} {dataset.options.displayed_status}{candidates}, "
+        f"{count(dataset.asked)} requested; "
         f"{count(dataset.shards)} shards, {size(dataset.size_bytes)}; worker time {duration(dataset.seconds)}",
         soft_wrap=True,
     )
@@ -346,8 +347,8 @@ def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
         bar = progress.add_task(name, total=1.0, rate="", left="")
         said = -1.0
         for dataset in client.watch_dataset(name):
-            pace = metric(dataset.counted / dataset.seconds) if dataset.seconds else None
-            rate = f"{pace} {dataset.options.standing}/s per worker" if pace is not None else ""
+            pace = metric(dataset.counted_grasps / dataset.seconds) if dataset.seconds else None
+            rate = f"{pace} {dataset.options.displayed_status}/s per worker" if pace is not None else ""
             left = f"{duration(dataset.eta_s)} left" if dataset.eta_s is not None else ""
             progress.update(bar, completed=dataset.progress, rate=rate, left=left)
             if not console.is_terminal and dataset.progress - said >= 0.05:
@@ -356,7 +357,7 @@ def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
     return dataset
 
 
-def _yield(made: Validated) -> str:
+def _yield_text(made: Validated) -> str:
     return f"at {valid_yield(made)}" if made.validated else "not validated"
 
 
@@ -365,8 +366,8 @@ def _cell_text(cell: CellView, options: JobOptions) -> str:
     if cell.state is State.RUNNING:
         words.append(percent(cell.progress))
     if cell.candidates:
-        made = cell.counted(options)
-        words.append(f"{count(made)}/{count(cell.asked)} {_yield(cell)}")
+        made = cell.counted_grasps(options)
+        words.append(f"{count(made)}/{count(cell.asked)} {_yield_text(cell)}")
     if cell.tasks_failed:
         words.append(f"{cell.tasks_failed} failed")
     return " ".join(words)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from graspd.api.formatting import count, minute
-from graspd.client.client import path_of
+from graspd.client.client import request_path
 from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, report_deletion, restore
 from graspd.service.cli import CommandGroup, JsonFlag, print_result
 from graspd.service.model.errors import InputError
@@ -67,13 +67,15 @@ def remove_tag(
     if "filter" in body:
         body["filter"]["tag"] = tag
     with open_client(url) as client:
-        _report_change(client.send("POST", path_of("tags", tag, "remove"), json=body).json(), "removed from", json=json)
+        _report_change(
+            client.send("POST", request_path("tags", tag, "remove"), json=body).json(), "removed from", json=json
+        )
 
 
 @app.command("delete", epilog="graspd tags delete good")
 def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
     """Delete a tag; its grasps remain."""
-    path = path_of("tags", tag)
+    path = request_path("tags", tag)
     with open_client(url) as client:
         has = client.send("GET", path).json()["grasps"]
         confirm(f"Delete the tag {tag} of {count(has)} grasps?", f"the tag {tag}", yes=yes)

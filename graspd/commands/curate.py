@@ -15,7 +15,7 @@ from graspd.service.readers.depth_noise import NOISES
 from graspd.service.readers.where import compile_expression
 from graspd.worker.files.clouds import hand_surface, write_clouds
 from graspd.worker.files.curation import KINDS, Balance
-from graspd.worker.files.subsets import UnvalidatedOption, shards_of, write_subset
+from graspd.worker.files.subsets import UnvalidatedOption, open_source, write_subset
 
 app = CommandGroup(no_args_is_help=True, add_completion=False)
 group = CommandGroup(no_args_is_help=True, help="Select grasps of files and datasets by their metrics.")
@@ -41,7 +41,7 @@ def where(
     test = compile_expression(expression)
     said = {"where": expression, "from": source}
     found = write_subset(
-        shards_of(source), lambda some: [test(shard.arrays, shard.attributes) for shard in some], out, said=said
+        open_source(source), lambda some: [test(shard.arrays, shard.attributes) for shard in some], out, said=said
     )
     _report(found, out, json=json)
 
@@ -73,7 +73,7 @@ def balance(
     chooser = Balance(kinds, at_most, min_distance, seed, hand, spread)
     said = {"balance": kinds, "from": source, "at_most": at_most, "min_distance": min_distance, "seed": seed}
     said |= {"spread": spread} if spread else {}
-    _report(write_subset(shards_of(source), chooser, out, said=said), out, json=json)
+    _report(write_subset(open_source(source), chooser, out, said=said), out, json=json)
 
 
 def _report(found: dict[str, int], out: Path, *, json: bool) -> None:
@@ -102,7 +102,7 @@ def clouds(
 
     In Python, `Pictures(shards).clouds()` computes the same clouds without files.
     """
-    pictures = Pictures(shards_of(source), unvalidated=unvalidated)
+    pictures = Pictures(open_source(source), unvalidated=unvalidated)
     if not len(pictures):
         raise InputError(f"{source} has no pictures; make some: graspd render")
     camera = None if noise == "none" else noise

@@ -15,8 +15,8 @@ from graspd.exchange.inputs import expand_path, load_case
 from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json, write_output
 from graspd.service.model.errors import InputError, choices_text
 from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
-from graspd.service.store.shards import carried_attributes, json_attribute, read_shard, write_shard
-from graspd.studies.evaluation import Protocol, combine, evaluate
+from graspd.service.store.shards import inherited_attributes, json_attribute, read_shard, write_shard
+from graspd.studies.evaluation import Protocol, combine_rows, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.subsets import require_empty_folder
 from graspd.worker.hands.hand_matching import TOLERANCE_M, match_hands
@@ -70,7 +70,7 @@ def evaluate_command(
     other = None if validation_hand is None else hand_from_path(validation_hand, drag=True)
     twins = _joint_map(joint_map)
     listed = [one for path in files for one in expand_path(path)]
-    copies = _copies(files, listed, out, robust=robust, hard=hard)
+    copies = _copy_paths(files, listed, out, robust=robust, hard=hard)
     rows: list[dict[str, Any]] = []
     name, done = TextColumn("{task.description}", markup=False), TextColumn("{task.completed:.0f}/{task.total:.0f}")
     columns = (name, BarColumn(), done, TimeElapsedColumn(), TimeRemainingColumn())
@@ -111,7 +111,7 @@ def _validate_level(protocol: str, level: str) -> str:
 
 
 def _report(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
-    whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])
+    whole = combine_rows([{key: value for key, value in row.items() if key != "file"} for row in rows])
     if json:
         verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
         whole.pop("verdicts", None)
@@ -121,13 +121,13 @@ def _report(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
         if whole.get("robust_share") is not None:
             typer.echo(_format_robustness(whole))
         if "foreign_held" in whole:
-            typer.echo(_foreign(whole, foreign))
+            typer.echo(_format_second_model(whole, foreign))
         for row in rows:
             if "note" in row:
                 typer.echo(row["note"], err=True)
 
 
-def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: int, hard: bool) -> dict[Path, Path]:
+def _copy_paths(paths: list[Path], files: list[Path], out: Path | None, *, robust: int, hard: bool) -> dict[Path, Path]:
     if out is None:
         return {}
     if not robust or hard or len(paths) != 1:
@@ -181,24 +181,24 @@ def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:
     for _, heading, _ in _COLUMNS:
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
-        table.add_row(Path(row["file"]).stem, *(_cell(row[key], digits) for key, _, digits in _COLUMNS))
+        table.add_row(Path(row["file"]).stem, *(_cell_text(row[key], digits) for key, _, digits in _COLUMNS))
     if len(rows) > 1:
         table.add_section()
-        table.add_row("all", *(_cell(whole[key], digits) for key, _, digits in _COLUMNS))
+        table.add_row("all", *(_cell_text(whole[key], digits) for key, _, digits in _COLUMNS))
     return table
 
 
-def _foreign(whole: dict[str, Any], name: str) -> str:
+def _format_second_model(whole: dict[str, Any], name: str) -> str:
     held = whole["foreign_held"]
-    share = _cell(whole["foreign_share"], 2)
+    share = _cell_text(whole["foreign_share"], 2)
     return (
-        f"{name}, fingertips within {whole['fingertips_mm']:.2f} mm: GSR {_cell(whole['foreign_gsr'], 2)}; "
+        f"{name}, fingertips within {whole['fingertips_mm']:.2f} mm: GSR {_cell_text(whole['foreign_gsr'], 2)}; "
         f"{held['both']} of {held['both'] + held['nominal']} grasps held by the first model also hold here ({share}); "
-        f"agreement {_cell(whole['agreement'], 2)}"
+        f"agreement {_cell_text(whole['agreement'], 2)}"
     )
 
 
-def _cell(value: float | None, digits: int) -> str:
+def _cell_text(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
@@ -206,7 +206,7 @@ def write_copy(source: Path, out: Path, found: Robustness) -> None:
     """Write a base shard with the robust shares of its grasps; all else, including its id, is unchanged."""
     shard = read_shard(source, kind="base")
     said = json_attribute({"models": found.held.shape[1], "wanted": found.wanted})
-    data = write_shard("base", {**shard.arrays, **found.columns}, {**carried_attributes(shard), "robust": said})
+    data = write_shard("base", {**shard.arrays, **found.columns}, {**inherited_attributes(shard), "robust": said})
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_output(out, data)

@@ -76,11 +76,11 @@ def export(
             training = TrainingExportOptions(hand, object_, unvalidated, every, held_out, noise)
             done = export_training(source, format_, training, output)
         elif format_ == "webdataset":
-            done = _webdataset(source, output, unvalidated=unvalidated, every=every)
+            done = _export_webdataset(source, output, unvalidated=unvalidated, every=every)
         elif format_ == "dexgraspbench":
-            done = _bench(source, hand, object_, output, unvalidated=unvalidated, every=every)
+            done = _export_dexgraspbench(source, hand, object_, output, unvalidated=unvalidated, every=every)
         else:
-            done = _pictures(source, format_, depth, output)
+            done = _export_pictures(source, format_, depth, output)
     told = {"folder": str(output), "format": format_, **done.counts, **({"notes": done.notes} if done.notes else {})}
     line = f"{output}: " + ", ".join(f"{n} {what}" for what, n in done.counts.items() if isinstance(n, int))
     print_result(told, line, json=json)
@@ -164,7 +164,7 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
     return read(source, hand=hand, obj=obj, **{name: options[name] for name in names})
 
 
-def _pictures(source: Path, format_: str, depth: str, output: Path) -> ExportSummary:
+def _export_pictures(source: Path, format_: str, depth: str, output: Path) -> ExportSummary:
     from graspd.exchange import replicator
     from graspd.worker.rendering.export import export_images
 
@@ -176,7 +176,7 @@ def _pictures(source: Path, format_: str, depth: str, output: Path) -> ExportSum
     return ExportSummary({"pictures": len(views["camera/eye"]), "files": len(written)})
 
 
-def _webdataset(source: Path, output: Path, *, unvalidated: bool, every: bool) -> ExportSummary:
+def _export_webdataset(source: Path, output: Path, *, unvalidated: bool, every: bool) -> ExportSummary:
     from graspd.exchange import webdataset
     from graspd.service.readers import Pictures, open_shards
 
@@ -185,7 +185,7 @@ def _webdataset(source: Path, output: Path, *, unvalidated: bool, every: bool) -
     return ExportSummary({"pictures": len(Pictures(shards)), "files": len(written)})
 
 
-def _bench(
+def _export_dexgraspbench(
     source: Path, hand: str | None, obj: str | None, output: Path, *, unvalidated: bool, every: bool
 ) -> ExportSummary:
     from graspd.exchange import dexgraspbench
@@ -228,7 +228,7 @@ def card(
 ) -> None:
     """Write a dataset's card: contents, origin, quality and biases; with plots and checksums."""
     from graspd.studies.cards.card import write_card
-    from graspd.studies.cards.contents import contents_of_folder, contents_of_store, with_provenance
+    from graspd.studies.cards.contents import add_provenance, contents_of_folder, contents_of_store
 
     if "/" in source or source in (".", ".."):
         if snapshot is not None:
@@ -238,7 +238,7 @@ def card(
         store = open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False)
         contents = contents_of_store(store, source, snapshot)
     if assets is not None:
-        contents = with_provenance(contents, assets)
+        contents = add_provenance(contents, assets)
     columns = (TextColumn("shards"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     console = plain_console(stderr=True)
     with Progress(*columns, console=console, disable=json or not console.is_terminal, transient=True) as bar:

@@ -14,15 +14,15 @@ from graspd.exchange.robots.execution import (
     STEP_S,
     Executions,
     RobotTrajectory,
-    executions,
-    hand_limits,
+    build_executions,
     straight_paths,
     time_motions,
     tool_frame,
+    velocity_limits,
 )
-from graspd.service.model.scene_spec import SceneSpec, supports_in
+from graspd.service.model.scene_spec import SceneSpec, scene_supports
 from graspd.service.model.transforms import compose, invert
-from graspd.service.readers.trajectories import Waypoint, scene_spec_of, trajectory_of, wrists_of
+from graspd.service.readers.trajectories import Waypoint, scene_spec_of, trajectory_of, wrist_angles
 from graspd.service.store.shards import Shard
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.provenance import neighbours_of_shard, scenes_of_shard
@@ -113,7 +113,7 @@ def surroundings_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
         return PictureScenes()
     poses = np.asarray(shard["scene/object_pose"], float)
     index = np.asarray(shard["grasp/scene_index"], np.intp)[rows]
-    return PictureScenes(supports_in(spec), poses, index, neighbours_of_shard(shard, []), wrists_of(shard, rows))
+    return PictureScenes(scene_supports(spec), poses, index, neighbours_of_shard(shard, []), wrist_angles(shard, rows))
 
 
 def _scene_of(shard: Shard) -> SceneSpec | None:
@@ -149,14 +149,14 @@ class GraspAnimation:
     run: ExecutionContext
     width: int | None = None
 
-    def file(self, suffix: str) -> bytes:
+    def encode(self, suffix: str) -> bytes:
         """Return the animation as GIF, WebP or animated PNG."""
         animation_kind(suffix)
         pictures: list[NDArray[np.uint8]] = []
         seconds: list[float] = []
         for row in self.rows:
             found = self._execute(row)
-            limits, names = hand_limits(found.hand), found.hand.joint_names
+            limits, names = velocity_limits(found.hand), found.hand.joint_names
             trajectory = time_motions(straight_paths(found, 0), names, limits.velocity, speed=SPEED)
             pictures.append(self._render(row, waypoints(found, trajectory)))
             shown = [STEP_S, *np.diff(trajectory.time).tolist()]
@@ -170,7 +170,7 @@ class GraspAnimation:
         grasps = GraspSet.from_columns(self.shard.arrays).take(one)
         placed = None if placed is None else placed.take(one)
         tool = tool_frame(None, self.hand.root_link, {})
-        return executions(self.hand, self.obj, grasps, rows=one, placed=placed, tool=tool, quality={})
+        return build_executions(self.hand, self.obj, grasps, rows=one, placed=placed, tool=tool, quality={})
 
     def _render(self, row: np.intp, trajectory: Sequence[Waypoint]) -> NDArray[np.uint8]:
         width = self.width or WIDTH

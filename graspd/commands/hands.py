@@ -15,7 +15,7 @@ from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
 from graspd.service.command_options import with_options
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.states import AssetKind
-from graspd.service.store.asset_options import HandWords, hand_options
+from graspd.service.store.asset_options import HandCommandOptions, hand_options
 from graspd.service.store.asset_summary import print_check, self_test_lines
 from graspd.service.store.descriptions import description_of
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
@@ -28,7 +28,7 @@ app = CommandGroup(add_completion=False)
 
 
 @app.command("check", epilog="graspd hands check my_hand.urdf --palm base_link --approach 0,0,1 --picture my_hand.png")
-@with_options(HandWords, "asset")
+@with_options(HandCommandOptions, "asset")
 def check(
     file: Annotated[str, typer.Argument(help="URDF, xacro or MJCF file, its folder or ZIP, or a built-in hand.")],
     options: dict[str, Any],
@@ -40,10 +40,10 @@ def check(
 ) -> None:
     """Check whether a hand can be used, report guesses, and run the self-test. Needs no server."""
     options = hand_options(**options)
-    with _bar("reading     ", quiet=json) as run:
+    with _progress_bar("reading     ", quiet=json) as run:
         report = report_hand(file, options, run)
     if picture and report["verdict"] != "refuse":
-        _draw(hand_from_path(file, options), picture, collision=collision)
+        _write_picture(hand_from_path(file, options), picture, collision=collision)
     if write and report["verdict"] != "refuse":
         _write(file, options, report, write)
     if not json:
@@ -62,12 +62,12 @@ def check(
 def _self_test(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]:
     from graspd.worker.stages.hand_self_test import self_test_facts
 
-    with _bar("self-test   ", "starting; the first run on a machine compiles its kernels", quiet=quiet) as run:
+    with _progress_bar("self-test   ", "starting; the first run on a machine compiles its kernels", quiet=quiet) as run:
         return self_test_facts(lambda: hand_from_path(file, options), run)
 
 
 @contextmanager
-def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[ExecutionContext]:
+def _progress_bar(what: str, first: str = "", *, quiet: bool) -> Iterator[ExecutionContext]:
     """Yield a context whose progress is shown on a terminal."""
     columns = (TextColumn(f"  {what}       {{task.description}}", markup=False), BarColumn(), TimeElapsedColumn())
     console = plain_console(stderr=True)
@@ -79,7 +79,7 @@ def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[ExecutionContex
         )
 
 
-def _draw(hand: HandModel, picture: Path, *, collision: bool) -> None:
+def _write_picture(hand: HandModel, picture: Path, *, collision: bool) -> None:
     from graspd.worker.rendering.hands import without_visuals
     from graspd.worker.rendering.portraits import hand_portrait, write_png
 

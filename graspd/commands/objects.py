@@ -14,7 +14,7 @@ from graspd.service.model.object_options import ObjectOptions
 from graspd.service.model.states import AssetKind
 from graspd.service.store.asset_summary import print_check, verdict_line
 from graspd.service.store.assets import builtin_names
-from graspd.service.store.object_sets import Objects, files_of_set
+from graspd.service.store.object_sets import Objects, find_set_objects
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.prepare import files_from_path, object_from_path
 
@@ -53,7 +53,7 @@ def _object_set(file: str) -> Objects | None:
     if file in builtin_names(AssetKind.OBJECT) and not Path(file).is_file():
         return None
     try:
-        return files_of_set(Path(file))
+        return find_set_objects(Path(file))
     except InputError:
         if Path(file).is_dir():
             raise

@@ -20,9 +20,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from graspd.commands.grasp_sheet import GraspAnimation, GraspSheet, Kind
 from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_result, write_output
 from graspd.service.model.errors import InputError
-from graspd.service.model.scene_spec import supports_in
+from graspd.service.model.scene_spec import scene_supports
 from graspd.service.model.transforms import compose
-from graspd.service.readers.trajectories import scene_spec_of, wrists_of
+from graspd.service.readers.trajectories import scene_spec_of, wrist_angles
 from graspd.service.store import validity
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.engines.devices import Device
@@ -40,7 +40,13 @@ from graspd.worker.rendering.annotate import parse_channels
 from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, read_cameras
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.scenery import TABLE
-from graspd.worker.rendering.sheets import best_in_scenes, best_rows, best_transferred_rows, views_page, with_palette
+from graspd.worker.rendering.sheets import (
+    best_in_scenes,
+    best_rows,
+    best_transferred_rows,
+    reduce_to_palette,
+    views_page,
+)
 from graspd.worker.rendering.trajectory_pictures import animation_kind
 from graspd.worker.rendering.views import Extras
 from graspd.worker.rendering.views import render as render_views
@@ -73,7 +79,7 @@ def render(
 ) -> None:
     """Render pictures of scenes: colour, depth, segmentation, boxes, and the `--channels` requested."""
     started = perf_counter()
-    scene = _scenes(scenes)
+    scene = _load_scenes(scenes)
     obj = object_of_shard(scene, object)
     number = int(scene.attributes.get("seed", 0)) if seed is None else seed  # type: ignore[arg-type]
     used = Device(device).resolve()
@@ -85,7 +91,7 @@ def render(
         cameras=given,
         neighbours=neighbours_of_shard(scene, with_ or []),
         drawn=_best_grasps(scene, hand) if scene.kind == "base" else _hand_in_pictures(scene, with_hand, hand),
-        supports=TABLE if spec is None else supports_in(spec),
+        supports=TABLE if spec is None else scene_supports(spec),
     )
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
@@ -157,12 +163,12 @@ def pictures(
     models = (hand_of_shard(base, hand), object_of_shard(base, object), rows)
     run = ExecutionContext(Device(device).resolve())
     if animate:
-        page = GraspAnimation(base, *models, run, size).file(output.suffix)
+        page = GraspAnimation(base, *models, run, size).encode(output.suffix)
     else:
         kind: Kind = "trajectory" if trajectory else "three sides" if three else "one side"
         subtitle = f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}"
         page = GraspSheet(base, *models, kind, run, size).png(subtitle=subtitle)
-    write_output(output, with_palette(page) if palette and not animate else page)
+    write_output(output, reduce_to_palette(page) if palette and not animate else page)
     told = {"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()}
     print_result(told, f"{output}: {'' if row else 'the best '}{len(rows)} of {among} {word}", json=json)
 
@@ -176,7 +182,7 @@ def _named_rows(base: Shard, rows: list[int], chosen: NDArray[np.bool_], word: s
     return np.array(rows, np.intp)
 
 
-def _scenes(path: Path) -> Shard:
+def _load_scenes(path: Path) -> Shard:
     shard = read_shard(path)
     if shard.kind == "base" and "scene/object_pose" not in shard.arrays:
         raise InputError(f"{path} has free grasps: a scene shard is needed here; make one: graspd scene")
@@ -193,7 +199,7 @@ def _best_grasps(base: Shard, hand: str | None) -> DrawnHand | None:
         return None
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     placed = compose(np.asarray(base["scene/object_pose"], float), poses)
-    return DrawnHand(hand_of_shard(base, hand), rows, placed, joints, wrists_of(base, rows))
+    return DrawnHand(hand_of_shard(base, hand), rows, placed, joints, wrist_angles(base, rows))
 
 
 def _hand_in_pictures(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
@@ -209,7 +215,7 @@ def _hand_in_pictures(scene: Shard, base_file: Path | None, hand: str | None) ->
     rows = best_transferred_rows(scene.arrays, base.arrays)
     joints = np.asarray(base["grasp/joint_positions"], float)[source[rows]]
     poses = np.asarray(scene["grasp/hand_pose"], float)[rows]
-    return DrawnHand(model, rows, poses, joints, wrists_of(scene, rows))
+    return DrawnHand(model, rows, poses, joints, wrist_angles(scene, rows))
 
 
 @app.command(epilog="graspd view grasps.h5")

@@ -25,7 +25,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.scenes.clearance import count_rejections, transfer_grasps
 from graspd.worker.scenes.neighbours import Neighbours, drop_together
-from graspd.worker.scenes.rest import rolling_note, rolling_poses
+from graspd.worker.scenes.rest import count_rolling_poses, rolling_note
 from graspd.worker.scenes.simulate import drop
 
 app = CommandGroup(add_completion=False)
@@ -61,7 +61,7 @@ def scene(
     attributes |= source_attributes(base) | {"shard_id": id_of_columns(result)}
     write_output(output, write_shard("scene", result, attributes))
     clear, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
-    rolling = rolling_poses(obj, poses)
+    rolling = count_rolling_poses(obj, poses)
     reasons = count_rejections(result["grasp/rejection"])
     found = {"file": str(output), "scenes": scenes, "grasps": total, "clear": clear, "rejected": reasons}
     found |= {"rolling_scenes": rolling, "seconds": round(seconds, 2)}

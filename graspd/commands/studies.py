@@ -21,7 +21,7 @@ from graspd.service.model.fidelity import FIDELITIES, OFFERED, Fidelity
 from graspd.service.model.metrics import ROBUST_MODELS
 from graspd.service.model.renamed import convert_chart
 from graspd.service.model.scene_spec import SceneSpec, parse_scene
-from graspd.service.model.studies import Stability, from_json
+from graspd.service.model.studies import Stability, parse_stability
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.store.records import STABILITY, chart_kind, publish_record
 from graspd.service.store.store import open_store
@@ -48,7 +48,7 @@ def bench(
 ) -> None:
     """Measure grasps per second of the planner, without quality metrics, and the time of each step."""
     from graspd.studies.bench import bench as measure
-    from graspd.studies.bench import table, write
+    from graspd.studies.bench import results_table, write
     from graspd.worker.hands.load import hand_from_path
     from graspd.worker.objects.prepare import object_from_path
 
@@ -66,7 +66,7 @@ def bench(
     )
     if out is not None:
         write(result, out)
-    print_result(result, table(result), json=json)
+    print_result(result, results_table(result), json=json)
 
 
 def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[float] | None) -> list[Fidelity]:
@@ -111,33 +111,33 @@ def stability(
     if unknown := [name for name in only or [] if name not in STUDIES]:
         raise InputError(f"there is no study {unknown[0]!r}; choose one of {choices_text(unknown[0], STUDIES)}")
     if source:
-        found = _merge([_read(path, "stability", from_json) for path in source])
+        found = _merge([_read_record(path, "stability", parse_stability) for path in source])
         found = replace(found, maps=[one for one in found.maps if not only or one.name in only])
     else:
-        found = _measure(tuple(only or STUDIES), hand, object_, quick=quick, long=long, threads=threads)
+        found = _measure_maps(tuple(only or STUDIES), hand, object_, quick=quick, long=long, threads=threads)
     if out is not None:
         write(found, out)
     key = _publish(STABILITY, found.as_json(), data_dir) if publish else None
-    good = {one.name: {panel: one.share(panel) for panel in one.panels} for one in found.maps}
-    still = {one.name: one.still_breaks() for one in found.maps}
+    good = {one.name: {panel: one.good_share(panel) for panel in one.panels} for one in found.maps}
+    still = {one.name: one.broken_cell_lines() for one in found.maps}
     told = {"good": good, "still_breaks": still, "out": None if out is None else str(out), "published": key}
     print_result(told, markdown(found), json=json)
 
 
-def _measure(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: bool, threads: int) -> Stability:
+def _measure_maps(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: bool, threads: int) -> Stability:
     from graspd.worker.engines import backend
 
     backend.start_warp()
     import warp as wp
 
-    from graspd.studies.stability.studies import run
+    from graspd.studies.stability.studies import run_studies
 
-    maps = run(names, hand, obj, quick=quick, long=long, work=ExecutionContext(threads=threads), say=_echo)
+    maps = run_studies(names, hand, obj, quick=quick, long=long, work=ExecutionContext(threads=threads), say=_echo)
     command = shlex.join(["graspd", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])
     return Stability(timestamp(), command, {"graspd": PACKAGE_VERSION, "warp": wp.__version__}, maps)
 
 
-def _read(path: Path, kind: str, parse: Callable[[Any], Any]) -> Any:
+def _read_record(path: Path, kind: str, parse: Callable[[Any], Any]) -> Any:
     """Parse a JSON file of `graspd KIND --out`; raise InputError for any other file."""
     try:
         return parse(loads(path.read_text()))
@@ -201,18 +201,18 @@ def chart(
     from graspd.studies.chart.chart import settings_of
     from graspd.studies.chart.report import write
     from graspd.studies.chart.sweeps import knob_values
-    from graspd.studies.chart.sweeps import sweep as turn
+    from graspd.studies.chart.sweeps import sweep_settings as turn
     from graspd.worker.hands.load import hand_from_path
 
     if source is not None:
-        _finish(_read_chart(source), out, data_dir, publish=publish, json=json)
+        _write_chart(_read_chart(source), out, data_dir, publish=publish, json=json)
         return
     knob_values(knobs=knob or ())  # Report a wrong name before an hour of work.
     if scene != "free" and sweep:
         raise InputError("--sweep is for charts of free objects; omit --scene")
-    place = _place(scene)
+    place = _chart_scene(scene)
     on = ExecutionContext(Device(device).resolve(), threads)
-    batches, models_around = [_number(part) for part in _parts(batch)], ROBUST_MODELS
+    batches, models_around = [_parse_batch(part) for part in _parts(batch)], ROBUST_MODELS
     if quick:
         hands, objects, fidelities = (_parts(text)[0] for text in (hands, objects, fidelities))
         batches, baseline_batch, repeats, models_around = [4], 2, 1, 2
@@ -222,27 +222,29 @@ def chart(
     models, things = [hand_from_path(part) for part in _parts(hands)], _chart_objects(_parts(objects))
     said = {"command": shlex.join(["graspd", *(_without_folders(word) for word in sys.argv[1:])]), "remark": remark}
 
-    def keep(so_far: dict[str, Any]) -> None:
+    def save_partial(so_far: dict[str, Any]) -> None:
         if out is not None:
             write(so_far | said, out)
 
     if place is None:
-        from graspd.studies.chart.chart import chart as run
+        from graspd.studies.chart.chart import measure_chart as run
 
-        result = run(models, things, chosen, repeats=repeats, models=models_around, say=_echo, keep=keep)
+        result = run(models, things, chosen, repeats=repeats, models=models_around, say=_echo, keep=save_partial)
     else:
         from graspd.studies.chart.scenes import scene_chart
 
-        result = scene_chart(models, things, chosen, place, models=models_around, work=work, say=_echo, keep=keep)
+        result = scene_chart(
+            models, things, chosen, place, models=models_around, work=work, say=_echo, keep=save_partial
+        )
     result |= said
     if sweep:
         result["sweeps"] = turn(
             models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=on, knobs=knob or (), say=_echo
         )
-    _finish(result, out, data_dir, publish=publish, json=json)
+    _write_chart(result, out, data_dir, publish=publish, json=json)
 
 
-def _finish(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, publish: bool, json: bool) -> None:
+def _write_chart(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, publish: bool, json: bool) -> None:
     from graspd.studies.chart.report import markdown, write
 
     if out is not None:
@@ -259,13 +261,13 @@ def _read_chart(path: Path) -> dict[str, Any]:
             raise ValueError("no chart")
         return found
 
-    found: dict[str, Any] = _read(path, "chart", parse)
+    found: dict[str, Any] = _read_record(path, "chart", parse)
     if missing := [key for key in ("summary", "by_hand", "models") if key not in found]:
         raise InputError(f"{path} has no {missing[0]}, because an earlier graspd wrote it; measure again")
     return found
 
 
-def _place(scene: str) -> SceneSpec | None:
+def _chart_scene(scene: str) -> SceneSpec | None:
     if scene == "free":
         return None
     spec = parse_scene(scene)
@@ -278,12 +280,12 @@ def _place(scene: str) -> SceneSpec | None:
 def _without_folders(word: str) -> str:
     """Remove local folders from a word of the command line, because they differ between machines."""
 
-    def one(part: str) -> str:
+    def shorten_path(part: str) -> str:
         if "/data/" in part:
             return "DATA/" + part.split("/data/", 1)[1]
         return Path(part).name if part.startswith("/") else part
 
-    return ",".join(one(part) for part in word.split(","))
+    return ",".join(shorten_path(part) for part in word.split(","))
 
 
 def _parts(text: str) -> list[str]:
@@ -293,7 +295,7 @@ def _parts(text: str) -> list[str]:
     return parts
 
 
-def _number(text: str) -> int:
+def _parse_batch(text: str) -> int:
     if not text.isdigit() or not 1 <= int(text) <= 4096:
         raise InputError(f"--batch {text!r} is no number of grasps from 1 to 4096")
     return int(text)
@@ -301,11 +303,11 @@ def _number(text: str) -> int:
 
 def _chart_objects(objects: Sequence[str]) -> list[Any]:
     from graspd.studies.chart.chart import ChartObject
-    from graspd.worker.objects.prepare import name_of, object_from_path
+    from graspd.worker.objects.prepare import object_from_path, object_name
 
     def load(text: str, error: float) -> Any:
         return object_from_path(text, face_error_m=error)
 
     for text in objects:
         load(text, 1e-3)  # Report a wrong file before an hour of work.
-    return [ChartObject(name_of(Path(text)), partial(load, text)) for text in objects]
+    return [ChartObject(object_name(Path(text)), partial(load, text)) for text in objects]

@@ -21,7 +21,7 @@ from graspd.service.cli import (
     print_result,
     write_output,
 )
-from graspd.service.command_options import parse_pairs, parsed_options, with_options
+from graspd.service.command_options import parse_pairs, validate_options, with_options
 from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.metrics import DIRECTION_CELLS
@@ -48,20 +48,20 @@ def synth(
     Exit code 3: fewer grasps than requested. Ctrl-C saves the validated grasps.
     """
     from graspd.worker.files.provenance import id_of_columns  # Help and completion need no engine.
-    from graspd.worker.files.synthesis import synthesize_with
+    from graspd.worker.files.synthesis import synthesize_with_options
 
     if not out.parent.is_dir():
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file in it, such as --out {out / 'grasps.h5'}")
     options["options"] = parse_pairs(options.get("options", ()))
-    asked = parsed_options(LocalOptions, options)
-    if "payload" not in options and asked.place.kind != "free" and asked.validation != "none":
+    asked = validate_options(LocalOptions, options)
+    if "payload" not in options and asked.scene_spec.kind != "free" and asked.validation != "none":
         asked = asked.model_copy(update={"payload": asked.mass is not None or asked.density is not None})
     settings = engine_settings()
-    with catch_stop_signals() as stop, _bar(quiet=json) as progress:
+    with catch_stop_signals() as stop, _progress_bar(quiet=json) as progress:
         try:
-            made = synthesize_with(
+            made = synthesize_with_options(
                 hand,
                 object_,
                 asked,
@@ -84,7 +84,7 @@ def synth(
 
 
 @contextmanager
-def _bar(*, quiet: bool) -> Iterator[Report]:
+def _progress_bar(*, quiet: bool) -> Iterator[Report]:
     """Show a progress bar on a terminal; yield the callback that updates it."""
     if quiet or not sys.stderr.isatty():
         yield lambda done, total, message: None

@@ -79,7 +79,7 @@ class Database:
         self._url = url
         self._anew = anew
         self.was = ""
-        self._file = _file_of(url)
+        self._file = _sqlite_file(url)
         self._write_lock = threading.Lock()
         self._opening = threading.Lock()
         self._identity: Identity = None
@@ -122,7 +122,7 @@ class Database:
         with self.read_transaction(within) as connection:
             return connection.execute(query).mappings().all()
 
-    def one(self, query: Select[Any], what: str, within: Connection | None = None) -> RowMapping:
+    def first_row(self, query: Select[Any], what: str, within: Connection | None = None) -> RowMapping:
         """Return the first row; NotFoundError `there is no {what}` if there is none."""
         if not (found := self.rows(query, within)):
             raise NotFoundError(f"there is no {what}")
@@ -209,7 +209,7 @@ def rows_in(
         yield from connection.execute(query.where(column.in_(some)))
 
 
-def _file_of(url: str | URL) -> SqliteFile | None:
+def _sqlite_file(url: str | URL) -> SqliteFile | None:
     """Return the file of an SQLite index, None if it has no file; InputError for an invalid URL."""
     with convert_url_errors():
         parsed = make_url(url)
@@ -241,7 +241,7 @@ def connect_postgres(url: str | URL) -> Engine:
 
     # Runs before SQLAlchemy inspects the connection: the inspection fails on SQL_ASCII databases, which return bytes.
     @event.listens_for(engine, "connect", insert=True)
-    def _is_utf8(connection: Any, _record: Any) -> None:
+    def _require_utf8(connection: Any, _record: Any) -> None:
         info = getattr(connection, "info", None)
         if info is not None and (encoding := info.parameter_status("server_encoding")) != "UTF8":
             raise InputError(
@@ -256,7 +256,7 @@ def _sqlite_engine(url: str | URL) -> Engine:
     engine = create_engine(url, connect_args={"timeout": _BUSY_TIMEOUT_S})
 
     @event.listens_for(engine, "connect")
-    def _pragmas(connection: Any, _record: Any) -> None:
+    def _set_pragmas(connection: Any, _record: Any) -> None:
         connection.isolation_level = None  # Only `write_transaction` begins transactions.
         for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", "temp_store=MEMORY"):
             connection.execute(f"PRAGMA {pragma}")

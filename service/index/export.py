@@ -11,7 +11,7 @@ from sqlalchemy import JSON, BigInteger, Boolean, Column, Connection, Float, Int
 
 from graspd.service.index.database import Database
 from graspd.service.index.tables import assets, attempts, dataset_cells, datasets, grasps, jobs, shards, spent, tasks
-from graspd.service.parquet import schema_of, write
+from graspd.service.parquet import arrow_schema, write
 
 #: Exported tables. Other tables contain current state (workers, notes) or internal data.
 _EXPORTED: Final = (grasps, shards, jobs, tasks, attempts, assets, datasets, dataset_cells, spent)
@@ -26,15 +26,15 @@ def export(database: Database, folder: Path) -> dict[str, int]:
     Rows are of one snapshot, ordered by primary key. Integers are int64, other numbers float64, JSON is text.
     """
     # The schemas need pyarrow: a missing package is reported before any query.
-    schemas = {name: schema_of({c.name: _type_name(c) for c in table.columns}) for name, table in TABLES.items()}
+    schemas = {name: arrow_schema({c.name: _type_name(c) for c in table.columns}) for name, table in TABLES.items()}
     with database.read_transaction() as connection:
         return {
-            name: write(folder / f"{name}.parquet", schemas[name], _groups(connection, table))
+            name: write(folder / f"{name}.parquet", schemas[name], _row_groups(connection, table))
             for name, table in TABLES.items()
         }
 
 
-def _groups(connection: Connection, table: Table) -> Iterator[list[dict[str, Any]]]:
+def _row_groups(connection: Connection, table: Table) -> Iterator[list[dict[str, Any]]]:
     documents = [column.name for column in table.columns if isinstance(column.type, JSON)]
     query = select(table).order_by(*table.primary_key.columns).execution_options(yield_per=GROUP)
     for part in connection.execute(query).mappings().partitions():

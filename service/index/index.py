@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sqlalchemy import URL
 
-from graspd.service.index.changes.records import Changes, DatasetChanges, Live
+from graspd.service.index.changes.records import Changes, DatasetChanges, LiveChanges
 from graspd.service.index.changes.removals import Removals
 from graspd.service.index.database import Database
 from graspd.service.index.notes import KnownDamage, Notes
@@ -42,7 +42,7 @@ class Index:
         self.dataset_feed = DatasetFeed(database)
         self.write = Changes(database)
         self.write_dataset = DatasetChanges(database)
-        self.live = Live(database)
+        self.live = LiveChanges(database)
         self.removals = Removals(database)
         self.notes = Notes(database)
         self.damage = KnownDamage(database)

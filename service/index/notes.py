@@ -64,14 +64,14 @@ class Notes(IndexPart):
         value = {"at": timestamp(), "left_out": len(left_out), "names": list(left_out[:_NAMED])}
         self._set(_REBUILT, value, within)
 
-    def service(self, *, within: Connection | None = None) -> str | None:
+    def service_id(self, *, within: Connection | None = None) -> str | None:
         value = self._get(_SERVICE, within)
         return None if value is None else str(value["id"])
 
-    def name_service(self, identity: str, *, instead: bool = False) -> str:
+    def set_service_id(self, identity: str, *, instead: bool = False) -> str:
         """Set the id of the service if it is unset or `instead` is true; return the id that applies."""
         with self.database.write_transaction() as connection:
-            if not instead and (known := self.service(within=connection)) is not None:
+            if not instead and (known := self.service_id(within=connection)) is not None:
                 return known
             self._set(_SERVICE, {"id": identity}, connection)
         return identity
@@ -83,7 +83,7 @@ class Notes(IndexPart):
     def count_change(self, *, within: Connection) -> None:
         self._set(_CHANGES, int(self._get(_CHANGES, within) or 0) + 1, within)
 
-    def changes(self) -> int:
+    def change_count(self) -> int:
         return int(self._get(_CHANGES) or 0)
 
     def store_mark(self) -> StoreMark:

@@ -28,23 +28,23 @@ class DueDelivery:
     attempts: int
 
 
-def append_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
+def append_end_events(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
     """Append ends of jobs and datasets within a transaction, numbered in ascending order.
 
     A number is the time [ms], or the last number plus 1 if greater: a new index continues the numbers of a lost one.
     """
     if rows:
-        first = max(last_end(connection) + 1, int(time.time() * 1000))
+        first = max(last_end_number(connection) + 1, int(time.time() * 1000))
         numbered = [{"seq": first + place, "at": timestamp(), **row} for place, row in enumerate(rows)]
         upsert(connection, ends, numbered)
 
 
-def last_end(connection: Connection) -> int:
+def last_end_number(connection: Connection) -> int:
     return int(connection.scalar(select(func.max(ends.c.seq))) or 0)
 
 
 class Outbox(IndexPart):
-    def ends(self, since: int, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[EndView]:
+    def end_events(self, since: int, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[EndView]:
         query = select(ends).where(ends.c.seq > since, *scope_conditions(scope, ends)).order_by(ends.c.seq).limit(limit)
         return [EndView(**row) for row in self.database.rows(query)]
 
@@ -59,13 +59,13 @@ class Outbox(IndexPart):
         with self.database.write_transaction() as connection:
             untold = (datasets.c.name == name, datasets.c.told < events)
             if connection.execute(update(datasets).where(*untold).values(told=events)).rowcount:
-                append_ends(connection, [row])
+                append_end_events(connection, [row])
 
     def add(self, hook: Webhook, *, seen: int | None = None, within: Connection | None = None) -> None:
         """Add a webhook; it receives ends after number `seen`, by default all future ends."""
         row = {name: getattr(hook, name) for name in ("id", "url", "created", "owner", "project")}
         with self.database.write_transaction(within) as connection:
-            row |= {"states": list(hook.states), "seen": last_end(connection) if seen is None else seen}
+            row |= {"states": list(hook.states), "seen": last_end_number(connection) if seen is None else seen}
             upsert(connection, webhooks, [row], keep=("seen",))
 
     def webhooks(self, *, scope: ProjectScope = EVERYTHING) -> list[WebhookView]:
@@ -74,14 +74,14 @@ class Outbox(IndexPart):
 
     def webhook(self, webhook: str, *, scope: ProjectScope = EVERYTHING) -> WebhookView:
         query = select(webhooks).where(webhooks.c.id == webhook, *scope_conditions(scope, webhooks))
-        return WebhookView(**self.database.one(query, f"webhook {webhook!r}"))
+        return WebhookView(**self.database.first_row(query, f"webhook {webhook!r}"))
 
     def remove(self, webhook: str) -> None:
         with self.database.write_transaction() as connection:
             connection.execute(delete(deliveries).where(deliveries.c.webhook == webhook))
             connection.execute(delete(webhooks).where(webhooks.c.id == webhook))
 
-    def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
+    def delivery_log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
         query = select(deliveries, ends.c.kind, ends.c.subject, ends.c.state.label("ended"))
         query = query.join(ends, ends.c.seq == deliveries.c.seq).where(deliveries.c.webhook == webhook)
         return [DeliveryView(**row) for row in self.database.rows(query.order_by(deliveries.c.seq.desc()).limit(limit))]
@@ -141,7 +141,7 @@ class Outbox(IndexPart):
             connection.execute(of_hook.where(deliveries.c.seq == due.end.seq).values(**values))
             connection.execute(of_hook.where(deliveries.c.state == "waiting").values(**others))
 
-    def forget_old(self) -> None:
+    def delete_expired(self) -> None:
         oldest = int((time.time() - KEPT_S) * 1000)
         with self.database.write_transaction() as connection:
             connection.execute(delete(deliveries).where(deliveries.c.seq < oldest))

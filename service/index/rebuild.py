@@ -16,7 +16,7 @@ from sqlalchemy.exc import DataError
 from graspd.service.index.changes.records import QUIET
 from graspd.service.index.index import Index
 from graspd.service.index.notes import StoreMark
-from graspd.service.index.outbox import last_end
+from graspd.service.index.outbox import last_end_number
 from graspd.service.index.tables import LIVE_COLUMNS, LIVE_TABLES, datasets, jobs, metadata, shards, webhooks
 from graspd.service.model import names
 from graspd.service.model.errors import DamagedError, InputError, NotFoundError
@@ -79,7 +79,7 @@ class _Rebuild:
         self.counts = dict.fromkeys(("assets", "jobs", "attempts", "shards", "datasets", "snapshots", "object_sets"), 0)
         self.left_out: list[str] = []
         self._gone = pending_deletions(store)
-        self._last = last_end(connection)
+        self._last = last_end_number(connection)
         self._seen = {row.id: row.seen for row in connection.execute(select(webhooks))}
         self._told = {row.name: row.told for row in connection.execute(select(datasets))}
 
@@ -93,7 +93,7 @@ class _Rebuild:
     def add_jobs(self) -> None:
         """Add jobs, then failed attempts by number, then events."""
         known = []
-        for key, data in self._read(names.JOBS, lambda key: key.endswith("/job.json") and key.count("/") == 2):
+        for key, data in self._read_records(names.JOBS, lambda key: key.endswith("/job.json") and key.count("/") == 2):
             with self._skip_invalid(key, "jobs"):
                 record = parse_record(JobRecord, data, key)
                 self._index.write.add_job(record, within=self._connection)
@@ -107,12 +107,12 @@ class _Rebuild:
                 self._index.write.set_job_events(job, events, within=self._connection)
 
     def add_shards(self) -> None:
-        for key, data in self._read(names.SHARDS):
+        for key, data in self._read_records(names.SHARDS):
             with self._skip_invalid(key, "shards"):
                 self._index.write.add_manifests([parse_record(ShardManifest, data, key)], within=self._connection)
 
     def add_datasets(self) -> None:
-        for key, data in self._read(names.DATASETS, lambda key: key.endswith("/dataset.json")):
+        for key, data in self._read_records(names.DATASETS, lambda key: key.endswith("/dataset.json")):
             with self._skip_invalid(key, "datasets"):
                 record = parse_record(DatasetRecord, data, key)
                 self._index.write_dataset.add(record, within=self._connection)
@@ -121,41 +121,41 @@ class _Rebuild:
         told = self._index.datasets.ended_event_counts(within=self._connection) | self._told
         for name, events in told.items():
             self._connection.execute(update(datasets).where(datasets.c.name == name).values(told=events))
-        for key, data in self._read(names.DATASETS, lambda key: "/snapshots/" in key):
+        for key, data in self._read_records(names.DATASETS, lambda key: "/snapshots/" in key):
             with self._skip_invalid(key, "snapshots"):
                 self._index.write_dataset.add_snapshot(parse_record(Snapshot, data, key), within=self._connection)
-        for key, data in self._read(names.OBJECT_SETS):
+        for key, data in self._read_records(names.OBJECT_SETS):
             with self._skip_invalid(key, "object_sets"):
                 self._index.write_dataset.add_object_set(parse_record(ObjectSet, data, key), within=self._connection)
 
     def add_webhooks(self) -> None:
-        for key, data in self._read(names.WEBHOOKS):
+        for key, data in self._read_records(names.WEBHOOKS):
             with self._skip_invalid(key):
                 hook = parse_record(Webhook, data, key)
                 self._index.outbox.add(hook, seen=self._seen.get(hook.id, self._last), within=self._connection)
 
     def add_tags(self) -> None:
         """Add the last version of each tag; earlier versions remain in the store after interrupted changes."""
-        last = {key.rpartition("/")[0]: (key, data) for key, data in sorted(self._read(names.TAGS))}
+        last = {key.rpartition("/")[0]: (key, data) for key, data in sorted(self._read_records(names.TAGS))}
         for key, data in last.values():
             with self._skip_invalid(key):
                 self._index.tags.put(parse_record(Tag, data, key), within=self._connection)
 
     def _parse_records(self, model: type[RecordT], prefix: str) -> list[RecordT]:
         found = []
-        for key, data in sorted(self._read(prefix)):
+        for key, data in sorted(self._read_records(prefix)):
             with self._skip_invalid(key):
                 found.append(parse_record(model, data, key))
         return found
 
-    def _read(
+    def _read_records(
         self, prefix: str, wanted: Callable[[str], bool] = lambda key: key.endswith(".json")
     ) -> Iterator[tuple[str, bytes]]:
         """Yield key and bytes of each record below a prefix, except those of deleted jobs and datasets."""
         listed = (entry.key for entry in self._store.list(prefix))
         keys = [key for key in listed if wanted(key) and not self._is_deleted(key)]
         with ThreadPoolExecutor(_READERS) as pool:
-            for key, data in zip(keys, pool.map(self._bytes, keys), strict=True):
+            for key, data in zip(keys, pool.map(self._read_bytes, keys), strict=True):
                 if data is not None:
                     yield key, data
 
@@ -164,7 +164,7 @@ class _Rebuild:
         what = {names.JOBS: "job", names.DATASETS: "dataset"}.get(folder, "")
         return (what, rest.partition("/")[0]) in self._gone
 
-    def _bytes(self, key: str) -> bytes | None:
+    def _read_bytes(self, key: str) -> bytes | None:
         """Return the bytes of a record; None if it was removed since the listing."""
         with suppress(NotFoundError):
             return self._store.get(key)
@@ -184,7 +184,7 @@ class _Rebuild:
             self._progress(what, self.counts[what])
 
 
-def complete_if_new(index: Index, store: Store) -> None:
+def mark_complete_if_new(index: Index, store: Store) -> None:
     """Mark an index of unknown completeness as complete if the store has no jobs and no datasets."""
     if index.notes.completeness() is None and not any(any(store.list(key)) for key in (names.JOBS, names.DATASETS)):
         index.notes.set_complete()

@@ -30,7 +30,7 @@ class Tags(IndexPart):
             raise NotFoundError(f"there is no tag {name!r}")
         return str(found)
 
-    def of(self, wanted: Collection[Grasp], *, scope: ProjectScope = EVERYTHING) -> dict[Grasp, list[str]]:
+    def names_by_grasp(self, wanted: Collection[Grasp], *, scope: ProjectScope = EVERYTHING) -> dict[Grasp, list[str]]:
         """Return the tag names of each given grasp that has any."""
         found: dict[Grasp, list[str]] = {}
         query = select(tagged.c.shard_id, tagged.c.row, tags.c.name).order_by(tags.c.name)

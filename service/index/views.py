@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, computed_field
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.metric_fields import insert_fields, value_fields
 from graspd.service.model.planning import explain_shortfall
-from graspd.service.model.records import Choice
+from graspd.service.model.records import FidelityChoice
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 
 T = TypeVar("T")
@@ -68,7 +68,7 @@ class JobView(Validated):
     owner: str = Field("", description="id of the key that submitted it; empty: none or unknown")
     project: str = Field("", description="its project; empty: the unnamed project")
     finished: str | None
-    choice: Choice | None = Field(None, description="how a chart replaced the fidelity auto, if requested")
+    choice: FidelityChoice | None = Field(None, description="how a chart replaced the fidelity auto, if requested")
     reason: str | None = Field(None, description="why the job failed: error of its first failed task")
     stages: list[StageProgress] = []
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
@@ -79,10 +79,12 @@ class JobView(Validated):
     @property
     def note(self) -> str | None:
         request = self.request
-        found = self.valid if request.counted == "valid" else self.grasps
+        found = self.valid if request.counted_status == "valid" else self.grasps
         if self.state is not State.SUCCEEDED or request.want != "valid":
             return None
-        return explain_shortfall(found, request.grasps, request.counted, self.candidates, request.budget, self.outcomes)
+        return explain_shortfall(
+            found, request.grasps, request.counted_status, self.candidates, request.budget, self.outcomes
+        )
 
 
 class TaskView(View):
@@ -321,13 +323,15 @@ class DatasetView(Validated):
     def reason(self) -> str | None:
         if not self.state.is_final or self.options.want != "valid":
             return None
-        options, found = self.options, self.counted
-        return explain_shortfall(found, self.asked, options.counted, self.candidates, options.budget, self.outcomes)
+        options, found = self.options, self.counted_grasps
+        return explain_shortfall(
+            found, self.asked, options.counted_status, self.candidates, options.budget, self.outcomes
+        )
 
     @property
-    def counted(self) -> int:
+    def counted_grasps(self) -> int:
         """Number of grasps that count: valid ones, or all stored ones if validation is off."""
-        return self.valid if self.options.standing == "valid" else self.grasps
+        return self.valid if self.options.displayed_status == "valid" else self.grasps
 
 
 class CellView(Validated):
@@ -338,7 +342,7 @@ class CellView(Validated):
     object: str
     job_id: str
     fidelity: str = Field("", description="name of the fidelity; in a dataset with `auto`, the chart's choice")
-    choice: Choice | None = Field(None, description="how a chart chose the fidelity")
+    choice: FidelityChoice | None = Field(None, description="how a chart chose the fidelity")
     planned: bool = Field(description="whether the job exists")
     state: State
     asked: int = Field(description="grasps requested")
@@ -350,9 +354,9 @@ class CellView(Validated):
     seconds: float = Field(description="total worker time [s]")
     reason: str | None = Field(description="why it failed, or found fewer grasps than requested")
 
-    def counted(self, options: JobOptions) -> int:
+    def counted_grasps(self, options: JobOptions) -> int:
         """Number of grasps that count: valid ones, or all stored ones if validation is off."""
-        return self.valid if options.standing == "valid" else self.grasps
+        return self.valid if options.displayed_status == "valid" else self.grasps
 
 
 class SnapshotView(View):
@@ -367,9 +371,9 @@ class SnapshotView(View):
     valid: int
     size_bytes: int
 
-    def counted(self, options: JobOptions) -> int:
+    def counted_grasps(self, options: JobOptions) -> int:
         """Number of grasps that count: valid ones, or all stored ones if validation is off."""
-        return self.valid if options.standing == "valid" else self.grasps
+        return self.valid if options.displayed_status == "valid" else self.grasps
 
 
 class ObjectSetView(View):

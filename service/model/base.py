@@ -76,12 +76,12 @@ def first_error(
 def bounds_of(field: FieldInfo) -> dict[str, float]:
     """Return the bounds of a number, optional or not, by their names in pydantic: ge, gt, le, lt."""
     found: dict[str, float] = {}
-    for one in [*(part for kind in get_args(field.annotation) for part in _metadata(kind)), *field.metadata]:
+    for one in [*(part for kind in get_args(field.annotation) for part in _annotation_metadata(kind)), *field.metadata]:
         found |= {key: value for key in _BOUNDS.values() if (value := getattr(one, key, None)) is not None}
     return found
 
 
-def _metadata(annotation: object) -> list[object]:
+def _annotation_metadata(annotation: object) -> list[object]:
     inner = get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
     return [part for one in inner for part in (one.metadata if isinstance(one, FieldInfo) else (one,))]
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 Colour = tuple[float, float, float]
 
 
-def linear(red: float, green: float, blue: float) -> Colour:
+def linear_rgb(red: float, green: float, blue: float) -> Colour:
     """Convert sRGB components in 0..1 to linear RGB (IEC 61966-2-1)."""
 
-    def one(c: float) -> float:
+    def linear_channel(c: float) -> float:
         return c / 12.92 if c <= 0.04045 else float(((c + 0.055) / 1.055) ** 2.4)
 
-    return one(red), one(green), one(blue)
+    return linear_channel(red), linear_channel(green), linear_channel(blue)
 
 
-def hexadecimal(code: str) -> Colour:
+def linear_rgb_from_hex(code: str) -> Colour:
     """Convert a colour such as `#c8553d` to linear RGB."""
     digits = code.lstrip("#")
-    return linear(*(int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)))
+    return linear_rgb(*(int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)))

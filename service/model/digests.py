@@ -65,23 +65,26 @@ def shard_id(
     if stage is Stage.SYNTHESIZE:
         inputs_of |= {
             "method": request.method,
-            "fidelity": request.knobs.model_dump(mode="json"),
+            "fidelity": request.resolved_fidelity.model_dump(mode="json"),
             "friction": request.friction,
             **({"options": request.options} if request.options else {}),
             **({"matter": request.object_properties} if request.object_properties else {}),
-            **_verdict_text(request, range(batch, batch + count_batches(count))),
+            **_validation_inputs(request, range(batch, batch + count_batches(count))),
         }
     elif stage is Stage.SCENE:
         inputs_of |= {"scenes": request.scenes}
         if request.in_scene:
             # Scenes made before the grasps depend on the planner's mesh of the object.
-            inputs_of |= {"scene": request.place.model_dump(mode="json"), "face_error_m": request.knobs.face_error_m}
+            inputs_of |= {
+                "scene": request.scene_spec.model_dump(mode="json"),
+                "face_error_m": request.resolved_fidelity.face_error_m,
+            }
     elif stage is Stage.RENDER:
         inputs_of |= {k: getattr(request, k) for k in ("views", "stereo", "width", "height", "channels")}
     return digest_json(inputs_of)
 
 
-def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
+def _validation_inputs(request: JobRequest, batches: range) -> dict[str, object]:
     found: dict[str, object] = {}
     if request.want == "valid":
         found |= {"want": request.want, "budget": request.budget}
@@ -90,8 +93,8 @@ def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
     if request.validation != "none":
         rechecks = sum(map(request.rechecks_of, batches))
         found |= {"validation": request.validation, "rechecks": rechecks}
-    if request.models:
-        found |= {"robust": [request.models, request.robust]}
+    if request.model_count:
+        found |= {"robust": [request.model_count, request.robust]}
     if request.measures_payload:
         found |= {"payload": [_PAYLOAD_REVISION, request.min_payload]}
     if request.shake:

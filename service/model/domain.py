@@ -18,7 +18,7 @@ from graspd.service.model.fidelity import AUTO, OFFERED, Fidelity, resolve_fidel
 from graspd.service.model.grasp_types import GraspTypeName
 from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG, Density, Friction, Mass
 from graspd.service.model.metrics import MIN_DISTANCE_M, MOST_ROBUST_MODELS, ROBUST_MODELS
-from graspd.service.model.options import JOB, Form, Option
+from graspd.service.model.options import JOB, FormField, Option
 from graspd.service.model.projects import Project
 from graspd.service.model.scene_spec import (
     MOST_NEIGHBOURS,
@@ -29,8 +29,8 @@ from graspd.service.model.scene_spec import (
     SceneOption,
     SceneSpec,
     Touch,
+    build_scene_spec,
     has_table,
-    scene_of,
 )
 from graspd.service.model.states import AssetKind
 
@@ -73,7 +73,7 @@ Cone = Annotated[str, Field(max_length=80), AfterValidator(lambda text: text and
 WristPose = Annotated[str, Field(max_length=160), AfterValidator(lambda text: text and parse_pose(text) and text)]
 
 
-def _sparse(default: Any, **facts: Any) -> Any:
+def _sparse_field(default: Any, **facts: Any) -> Any:
     """Return a field that JSON omits at its default: new fields change no ids and records of old jobs."""
     return Field(default, exclude_if=lambda value: value == default, **facts)
 
@@ -85,29 +85,29 @@ class JobOptions(Model):
     """True for jobs of a service; False for work in this process."""
 
     grasps: Annotated[
-        int, Option("basic", flags="--grasps -n"), Form("grasps", "Number of grasps", "in batches of 32")
+        int, Option("basic", flags="--grasps -n"), FormField("grasps", "Number of grasps", "in batches of 32")
     ] = Field(32, ge=1, le=1_000_000, description="number of grasps; in a dataset, for each pair of hand and object")
     method: Annotated[Name, Option("basic")] = Field(
         "fast_graspd", description=f"planner: {', '.join(METHODS)}, or one of another package"
     )
-    fidelity: Annotated[str | Fidelity, Option("basic"), Form("grasps", "Fidelity")] = Field(
+    fidelity: Annotated[str | Fidelity, Option("basic"), FormField("grasps", "Fidelity")] = Field(
         "standard", description=f"{', '.join(OFFERED)}, or auto with a target"
     )
-    seed: Annotated[int, Option("basic"), Form("grasps", "Seed", "same seed, same grasps")] = Field(
+    seed: Annotated[int, Option("basic"), FormField("grasps", "Seed", "same seed, same grasps")] = Field(
         0, ge=0, lt=2**31, description="the same seed gives the same grasps"
     )
     scene: Annotated[
         SceneOption,
         Option("basic", typed="scene of the grasps: free, table, bin, shelf, or a JSON or YAML file"),
-        Form("scenes", "Scene", choices=_SCENE_LABELS, cells=True),
-    ] = _sparse(
+        FormField("scenes", "Scene", choices=_SCENE_LABELS, cells=True),
+    ] = _sparse_field(
         "free",
         description="scene in which grasps are planned, validated, rendered and counted: free (a floating object), "
         "table, bin, shelf, or JSON with supports",
     )
     faces: Annotated[
-        Literal["drawn", "all"], Option(), Form("scenes", "Resting face", choices=_FACE_LABELS, cells=True)
-    ] = _sparse(
+        Literal["drawn", "all"], Option(), FormField("scenes", "Resting face", choices=_FACE_LABELS, cells=True)
+    ] = _sparse_field(
         "drawn",
         description="resting faces of the object. drawn: with their frequency after drops; all: one scene for each "
         "stable face, regardless of `scenes`",
@@ -115,8 +115,8 @@ class JobOptions(Model):
     neighbours: Annotated[
         tuple[BesideOption, ...],
         Option("basic", flags="--with", typed="neighbour in each scene: a name, or for graspd submit a mesh; up to 8"),
-        Form("scenes", "Neighbours", "names of up to 8 objects", placeholder="block, bottle", cells=True),
-    ] = _sparse(
+        FormField("scenes", "Neighbours", "names of up to 8 objects", placeholder="block, bottle", cells=True),
+    ] = _sparse_field(
         (),
         max_length=MOST_NEIGHBOURS,
         description="names of up to eight neighbours, dropped around the object; a scene with supports places its own",
@@ -124,86 +124,86 @@ class JobOptions(Model):
     touch: Annotated[
         Touch,
         Option(),
-        Form("scenes", "Fingertip clearance", "to supports; 0: contact allowed, 2: as for the hand", cells=True),
-    ] = _sparse(
+        FormField("scenes", "Fingertip clearance", "to supports; 0: contact allowed, 2: as for the hand", cells=True),
+    ] = _sparse_field(
         TOUCH,
         description="clearance of fingertips to supports [mm]. 2: as for the rest of the hand; 0: contact allowed; "
         "negative: fingertips may press into the support, for flat objects",
     )
     scenes: Annotated[
-        int, Option("basic"), Form("scenes", "Scenes", "per batch; 0: none if the scene is free, else 4")
+        int, Option("basic"), FormField("scenes", "Scenes", "per batch; 0: none if the scene is free, else 4")
     ] = Field(0, ge=0, le=64, description=f"scenes per batch; 0: none if the scene is free, else {SCENES}")
-    views: Annotated[int, Option("basic", places=JOB), Form("scenes", "Views", "camera placements per scene")] = Field(
-        0, ge=0, le=256, description="camera placements per scene"
+    views: Annotated[int, Option("basic", places=JOB), FormField("scenes", "Views", "camera placements per scene")] = (
+        Field(0, ge=0, le=256, description="camera placements per scene")
     )
-    stereo: Annotated[bool, Option(places=JOB), Form("scenes", "Cameras", "Stereo: left and right eye")] = Field(
+    stereo: Annotated[bool, Option(places=JOB), FormField("scenes", "Cameras", "Stereo: left and right eye")] = Field(
         False, description="render a left and a right picture per placement"
     )
-    width: Annotated[int, Option(places=JOB), Form("scenes", "Width")] = Field(
+    width: Annotated[int, Option(places=JOB), FormField("scenes", "Width")] = Field(
         320, ge=16, le=4096, description="picture width [px]"
     )
-    height: Annotated[int, Option(places=JOB), Form("scenes", "Height")] = Field(
+    height: Annotated[int, Option(places=JOB), FormField("scenes", "Height")] = Field(
         240, ge=16, le=4096, description="picture height [px]"
     )
     channels: Annotated[tuple[Literal["distance", "normals", "occlusion"], ...], Option(places=JOB)] = Field(
         (), description="image channels besides colour, depth and segmentation: distance, normals or occlusion"
     )
     type: Annotated[
-        GraspTypeName, Option("basic", schema=7), Form("grasps", "Grasp type", choices=_TYPE_LABELS, cells=True)
-    ] = _sparse(
+        GraspTypeName, Option("basic", schema=7), FormField("grasps", "Grasp type", choices=_TYPE_LABELS, cells=True)
+    ] = _sparse_field(
         "any",
         description="type of the grasps by contact: power, precision, pinch, lateral, or a type of the GRASP taxonomy. "
         "balanced: power, precision and pinch in turn, one per batch",
     )
     digits: Annotated[
         tuple[DigitName, ...], Option(schema=7, typed="digit that may touch, such as thumb; the others stay open")
-    ] = _sparse(
+    ] = _sparse_field(
         (), max_length=6, description="digits that may touch: thumb, index, middle, ring, little; others stay open"
     )
     touch_region: Annotated[
         Region,
         Option(schema=7),
-        Form("grasps", "Contact region", "bounds [m], part or colour", placeholder="z > 0.05", cells=True),
-    ] = _sparse(
+        FormField("grasps", "Contact region", "bounds [m], part or colour", placeholder="z > 0.05", cells=True),
+    ] = _sparse_field(
         "",
         description="region of all contacts: bounds in the object's frame [m], such as z > 0.05, x < 0.02. part NAME: "
         "a group, object or material of an OBJ; a node, mesh or material of a GLB. color #rrggbb: faces of this colour",
     )
-    avoid_region: Annotated[Region, Option(schema=7)] = _sparse(
+    avoid_region: Annotated[Region, Option(schema=7)] = _sparse_field(
         "", description="region without contacts: bounds [m] such as z > 0.1, part NAME or color #rrggbb"
     )
     approach_cone: Annotated[
         Cone,
         Option(schema=7),
-        Form("grasps", "Approach cone", "axis and angle", placeholder="0, 0, -1, 30", cells=True),
-    ] = _sparse(
+        FormField("grasps", "Approach cone", "axis and angle", placeholder="0, 0, -1, 30", cells=True),
+    ] = _sparse_field(
         "",
         description="cone of the palm's approach: axis and largest angle [deg], such as 0, 0, -1, 30. The axis is in "
         "the frame of the scene, or of a free object",
     )
-    like: Annotated[WristPose, Option(schema=7)] = _sparse(
+    like: Annotated[WristPose, Option(schema=7)] = _sparse_field(
         "",
         description="demonstrated wrist pose x, y, z, qw, qx, qy, qz in the object's frame [m]. Grasps start around it "
         "and stay within 4 cm and 30 degrees",
     )
-    friction: Annotated[float, Option(), Form("grasps", "Friction coefficient", "Coulomb, for the metrics")] = Field(
-        1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics"
+    friction: Annotated[float, Option(), FormField("grasps", "Friction coefficient", "Coulomb, for the metrics")] = (
+        Field(1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics")
     )
     mass: Annotated[
-        Mass | None, Option("basic", schema=5), Form("grasps", "Mass of the object", "empty: its own, else 0.1 kg")
-    ] = _sparse(None, description=f"mass of the object [kg]; default: its own, else {MASS_KG:g} kg")
-    density: Annotated[Density | None, Option(schema=5)] = _sparse(
+        Mass | None, Option("basic", schema=5), FormField("grasps", "Mass of the object", "empty: its own, else 0.1 kg")
+    ] = _sparse_field(None, description=f"mass of the object [kg]; default: its own, else {MASS_KG:g} kg")
+    density: Annotated[Density | None, Option(schema=5)] = _sparse_field(
         None, description="density of the object [kg/m^3], instead of the mass"
     )
     object_friction: Annotated[
         Friction | None,
         Option(schema=5),
-        Form("grasps", "Friction in simulation", "Coulomb; empty: the object's own, else 0.6"),
-    ] = _sparse(
+        FormField("grasps", "Friction in simulation", "Coulomb; empty: the object's own, else 0.6"),
+    ] = _sparse_field(
         None, description=f"Coulomb coefficient of contacts in simulation; default: the object's own, else {FRICTION:g}"
     )
     want: Annotated[
-        Literal["valid", "candidates"], Option("basic"), Form("grasps", "Counted grasps", choices=_WANT_LABELS)
+        Literal["valid", "candidates"], Option("basic"), FormField("grasps", "Counted grasps", choices=_WANT_LABELS)
     ] = Field(
         "valid", description="grasps that count. valid: valid grasps (without validation: feasible); candidates: all"
     )
@@ -211,8 +211,8 @@ class JobOptions(Model):
         4.0, ge=1, le=100, description="maximum number of candidates per requested valid grasp"
     )
     min_distance: Annotated[
-        float, Option(), Form("grasps", "Least distance", "between two grasps of a batch; 0: no limit", cells=True)
-    ] = _sparse(
+        float, Option(), FormField("grasps", "Least distance", "between two grasps of a batch; 0: no limit", cells=True)
+    ] = _sparse_field(
         MIN_DISTANCE_M,
         ge=0,
         le=0.1,
@@ -223,7 +223,7 @@ class JobOptions(Model):
     validation: Annotated[
         Literal["dexgraspbench", "standard", "fast", "none"],
         Option("basic"),
-        Form("grasps", "Validation in MuJoCo", choices=_LEVEL_LABELS),
+        FormField("grasps", "Validation in MuJoCo", choices=_LEVEL_LABELS),
     ] = Field(
         "standard",
         description="level of validation in MuJoCo. fast: MuJoCo Warp on a GPU decides clear cases; none: no verdicts",
@@ -238,8 +238,8 @@ class JobOptions(Model):
     robust: Annotated[
         float,
         Option("basic"),
-        Form("grasps", "Robust share", "of 8 perturbed models in which a grasp must hold; 0: none", cells=True),
-    ] = _sparse(
+        FormField("grasps", "Robust share", "of 8 perturbed models in which a grasp must hold; 0: none", cells=True),
+    ] = _sparse_field(
         0.0,
         ge=0,
         le=1,
@@ -247,26 +247,30 @@ class JobOptions(Model):
         description="share of perturbed models in which a grasp must hold to count; 0: no requirement. With want "
         "candidates, all grasps are stored",
     )
-    robust_models: Annotated[int, Option()] = _sparse(
+    robust_models: Annotated[int, Option()] = _sparse_field(
         0,
         ge=0,
         le=MOST_ROBUST_MODELS,
         description=f"number of perturbed models per valid grasp; 0: {ROBUST_MODELS} if `robust` is given, else none",
     )
-    payload: Annotated[bool, Option(schema=5)] = _sparse(False, description="measure the payload of each valid grasp")
+    payload: Annotated[bool, Option(schema=5)] = _sparse_field(
+        False, description="measure the payload of each valid grasp"
+    )
     min_payload: Annotated[
         float,
         Option(schema=5),
-        Form("grasps", "Least payload", "mass that a grasp must lift to count; 0: no requirement", cells=True),
-    ] = _sparse(
+        FormField("grasps", "Least payload", "mass that a grasp must lift to count; 0: no requirement", cells=True),
+    ] = _sparse_field(
         0.0,
         ge=0,
         le=MOST_KG,
         allow_inf_nan=False,
         description="mass that a grasp must lift to count [kg], which implies `payload`; 0: no requirement",
     )
-    shake: Annotated[bool, Option(schema=5), Form("scenes", "After the lift", "Shake: 2 cm, 3 Hz", cells=True)] = (
-        _sparse(False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y of its scene")
+    shake: Annotated[bool, Option(schema=5), FormField("scenes", "After the lift", "Shake: 2 cm, 3 Hz", cells=True)] = (
+        _sparse_field(
+            False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y of its scene"
+        )
     )
     options: Annotated[
         dict[
@@ -329,7 +333,7 @@ class JobOptions(Model):
         return self
 
     def _check_scene(self) -> None:
-        if self.place.kind != "free" and self.method in FREE_ONLY_METHODS:
+        if self.scene_spec.kind != "free" and self.method in FREE_ONLY_METHODS:
             raise ValueError(f"method {self.method} plans around free objects only: in a scene use fast_graspd")
         if not self.SUBMITTED:
             return
@@ -337,11 +341,11 @@ class JobOptions(Model):
             raise ValueError(SHAKE_NEEDS_A_SCENE)
         if self.method in NETWORK_METHODS and not self.network:
             raise ValueError(f"method {self.method} needs the option network: the name of a network in the service")
-        if self.method in NETWORK_METHODS and not has_table(self.place):
+        if self.method in NETWORK_METHODS and not has_table(self.scene_spec):
             raise ValueError(f"method {self.method} is for objects on a table: choose table, bin or a half-space")
 
     def _check_without_validation(self) -> None:
-        if self.models:
+        if self.model_count:
             raise ValueError("robust counts verdicts: choose a validator")
         if self.measures_payload:
             raise ValueError("payload is measured by a validator: choose one")
@@ -365,13 +369,13 @@ class JobOptions(Model):
         return {name: value for name, value in said.items() if value is not None}
 
     @property
-    def models(self) -> int:
+    def model_count(self) -> int:
         """Number of perturbed models in which each valid grasp is validated; 0: only the nominal model."""
         return self.robust_models or (ROBUST_MODELS if self.robust else 0)
 
     @property
-    def place(self) -> SceneSpec:
-        return scene_of(self.scene, faces=self.faces, touch=self.touch, beside=self._named_neighbours)
+    def scene_spec(self) -> SceneSpec:
+        return build_scene_spec(self.scene, faces=self.faces, touch=self.touch, beside=self._named_neighbours)
 
     @property
     def _named_neighbours(self) -> tuple[NamedNeighbour, ...]:
@@ -379,15 +383,15 @@ class JobOptions(Model):
         return tuple(one for one in self.neighbours if isinstance(one, NamedNeighbour))
 
     @property
-    def beside(self) -> tuple[NamedNeighbour, ...]:
+    def all_neighbours(self) -> tuple[NamedNeighbour, ...]:
         """Neighbours of a `SceneDocument`, then dropped neighbours."""
         placed = self.scene.neighbours if isinstance(self.scene, SceneDocument) else ()
         return (*placed, *self._named_neighbours)
 
-    def with_beside(self, found: Sequence[NamedNeighbour]) -> Self:
+    def replace_neighbours(self, found: Sequence[NamedNeighbour]) -> Self:
         if not found:
             return self
-        first = len(self.beside) - len(self.neighbours)
+        first = len(self.all_neighbours) - len(self.neighbours)
         changed: dict[str, Any] = {"neighbours": tuple(found[first:])}
         if isinstance(self.scene, SceneDocument):
             changed["scene"] = self.scene.model_copy(update={"neighbours": tuple(found[:first])})
@@ -402,31 +406,31 @@ class JobOptions(Model):
         return self.scene != "free"
 
     @property
-    def knobs(self) -> Fidelity:
+    def resolved_fidelity(self) -> Fidelity:
         """Settings of the fidelity; ValueError for `auto`, which a chart must resolve first."""
         return resolve_fidelity(self.fidelity)
 
     @property
-    def counted(self) -> Literal["valid", "feasible"]:
+    def counted_status(self) -> Literal["valid", "feasible"]:
         """Status of the grasps that count towards the requested number: valid, or without validation feasible."""
         return "feasible" if self.validation == "none" else "valid"
 
     @property
-    def standing(self) -> Literal["valid", "feasible", "kept"]:
-        """Status of the grasps that tables count: `counted`, or all stored ones for unvalidated candidates."""
-        return "kept" if self.counted == "feasible" and self.want == "candidates" else self.counted
+    def displayed_status(self) -> Literal["valid", "feasible", "kept"]:
+        """Status of the grasps that tables count: `counted_status`; for unvalidated candidates all stored."""
+        return "kept" if self.counted_status == "feasible" and self.want == "candidates" else self.counted_status
 
     def rechecks_of(self, batch: int) -> int:
         """Return the number of rechecks of a batch; by default, every other of the first batches has one."""
         if self.validation in ("none", "dexgraspbench"):
             return 0
         if self.rechecks == RECHECKS:
-            turn = batch + self._first_turn
+            turn = batch + self._recheck_offset
             return int(turn % _RECHECK_EVERY == 0 and batch // _RECHECK_EVERY < RECHECKS)
         return min(BATCH_SIZE, max(0, self.rechecks - batch * BATCH_SIZE))
 
     @property
-    def _first_turn(self) -> int:
+    def _recheck_offset(self) -> int:
         named = [getattr(self, name, "") for name in ("hand", "object")]
         return zlib.crc32("/".join([*named, str(self.seed)]).encode()) % _RECHECK_EVERY
 
@@ -446,7 +450,7 @@ def count_batches(grasps: int) -> int:
 
 def check_digests(options: JobOptions) -> None:
     """Raise ValueError if a neighbour or the network has no digest: a name may later refer to other files."""
-    if any(one.digest is None for one in options.beside):
+    if any(one.digest is None for one in options.all_neighbours):
         raise ValueError("each neighbour of a stored job has the digest of its files")
     if options.network and not re.fullmatch(DIGEST, options.network):
         raise ValueError("the network of a stored job has the digest of its files")

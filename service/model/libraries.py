@@ -16,7 +16,7 @@ version_of = lru_cache(maxsize=64)(version)
 _ours = False
 
 
-def mark_process() -> None:
+def freeze_imports() -> None:
     """Exclude imported objects from garbage collection in this process, which must be graspd's own."""
     global _ours
     _ours = True

@@ -92,25 +92,27 @@ class LocalOptions(MeshOptions, JobOptions):
         return data
 
     @property
-    def knobs(self) -> Fidelity:
+    def resolved_fidelity(self) -> Fidelity:
         knobs, solver = FIDELITIES[self.fidelity], self.contact_solver
         if solver is None:
             return knobs
         return knobs.model_copy(update={"contact_solver": solver, "name": f"{knobs.name}+{solver}"})
 
     @property
-    def place(self) -> SceneSpec:
+    def scene_spec(self) -> SceneSpec:
         """The scene; InputError if a file cannot be used."""
         return parse_scene(str(self.scene), faces=self.faces, touch=self.touch, beside=[*map(str, self.neighbours)])
 
     @property
-    def mesh(self) -> dict[str, Any]:
+    def mesh_options(self) -> dict[str, Any]:
         given = self.model_fields_set & MeshOptions.model_fields.keys()
         return {name: value for name in sorted(given) if (value := getattr(self, name))}
 
-    def request(self, options: dict[str, Any], like: str = "") -> JobOptions:
+    def job_options(self, options: dict[str, Any], like: str = "") -> JobOptions:
         """Return job options without scene and rechecks; `options` has digests of files, `like` a pose.
         Raise InputError."""
         shared = {name: getattr(self, name) for name in JobOptions.model_fields.keys() - _OF_PLACE}
         # Rechecks sample many jobs; a single file can be validated completely at level `dexgraspbench`.
-        return validate(JobOptions, shared | {"fidelity": self.knobs, "options": options, "rechecks": 0, "like": like})
+        return validate(
+            JobOptions, shared | {"fidelity": self.resolved_fidelity, "options": options, "rechecks": 0, "like": like}
+        )

@@ -86,7 +86,7 @@ Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
-class WorkerBeat:
+class WorkerHeartbeat:
     """Heartbeat of a worker, with its status and progress."""
 
     name: HostWord
@@ -139,7 +139,7 @@ class Capabilities:
     schemas: tuple[int, int]
     revisions: Mapping[str, int]
 
-    def lacks(self, need: Requirements) -> str:
+    def unmet_requirement(self, need: Requirements) -> str:
         """Return the first requirement that the worker does not meet, as a sentence; "" if it meets all."""
         oldest, newest = self.schemas
         if need.schema > newest:

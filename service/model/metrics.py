@@ -302,7 +302,7 @@ ROBUST_MODELS: Final = 8
 MOST_ROBUST_MODELS: Final = 64
 
 
-class Axis(IntEnum):
+class PerturbedParameter(IntEnum):
     """Perturbed parameter of a model. Shards contain its number, so new parameters must be appended."""
 
     NONE = 0
@@ -321,23 +321,23 @@ class Axis(IntEnum):
         return self.name.lower()
 
 
-AXIS_MEANINGS: Final[dict[Axis, str]] = {
-    Axis.SHAPES: "collision shapes",
-    Axis.JOINTS: "joint drives",
-    Axis.COUPLINGS: "couplings of joints",
-    Axis.FRICTION: "friction",
-    Axis.MASS: "mass of the object",
-    Axis.CENTRE: "centre of mass",
-    Axis.POSE: "pose of the object",
-    Axis.CALIBRATION: "calibration of the hand",
-    Axis.ORDER: "order of closing",
+AXIS_MEANINGS: Final[dict[PerturbedParameter, str]] = {
+    PerturbedParameter.SHAPES: "collision shapes",
+    PerturbedParameter.JOINTS: "joint drives",
+    PerturbedParameter.COUPLINGS: "couplings of joints",
+    PerturbedParameter.FRICTION: "friction",
+    PerturbedParameter.MASS: "mass of the object",
+    PerturbedParameter.CENTRE: "centre of mass",
+    PerturbedParameter.POSE: "pose of the object",
+    PerturbedParameter.CALIBRATION: "calibration of the hand",
+    PerturbedParameter.ORDER: "order of closing",
 }
 
 AXIS_WORDS: Final = tuple(axis.word for axis in AXIS_MEANINGS)
 
 
-def axis_word(number: int) -> str | None:
-    return Axis(number).word if number in AXIS_MEANINGS else None
+def perturbed_parameter_name(number: int) -> str | None:
+    return PerturbedParameter(number).word if number in AXIS_MEANINGS else None
 
 
 class GraspType(IntEnum):

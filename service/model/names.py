@@ -132,7 +132,7 @@ MOST: Final = 64
 log = logging.getLogger(__name__)
 
 
-def check_length(name: str) -> str:
+def check_name_length(name: str) -> str:
     """Return a name that a user chose; InputError if it is too long."""
     if len(name) > MOST:
         raise InputError(f"the name {name} has {len(name)} characters, more than {MOST}; give a shorter one")
@@ -140,7 +140,7 @@ def check_length(name: str) -> str:
 
 
 @lru_cache(maxsize=4096)
-def shorten(name: str, most: int = MOST) -> str:
+def shorten_name(name: str, most: int = MOST) -> str:
     """Return the name; replace a long name by its beginning and a digest, and log this once."""
     if len(name) <= most:
         return name

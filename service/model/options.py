@@ -1,4 +1,4 @@
-"""Tables of options: command line, dashboard forms, Python signatures and docs derive from `rows`."""
+"""Tables of options: command line, forms, Python signatures and docs derive from `option_rows`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _UNIT: Final = re.compile(r"\[([^\]]+)\]")
 
 
 @dataclass(frozen=True)
-class Form:
+class FormField:
     """Input of an option in a dashboard form."""
 
     section: Literal["grasps", "scenes"]
@@ -54,14 +54,14 @@ class Option:
 
 
 @dataclass(frozen=True)
-class Row:
+class OptionRow:
     name: str
     field: FieldInfo
     option: Option
 
     @property
-    def form(self) -> Form | None:
-        return next((one for one in self.field.metadata if isinstance(one, Form)), None)
+    def form(self) -> FormField | None:
+        return next((one for one in self.field.metadata if isinstance(one, FormField)), None)
 
     @property
     def flags(self) -> list[str]:
@@ -92,12 +92,12 @@ class Row:
     @property
     def kind(self) -> Any:
         """Type on a command line or in a form: bool, int, float, str, a Literal of strings, or list[str]."""
-        return _kind(self.field.annotation)
+        return _value_type(self.field.annotation)
 
 
-def rows(model: type[BaseModel], place: Place) -> list[Row]:
+def option_rows(model: type[BaseModel], place: Place) -> list[OptionRow]:
     found = [
-        Row(name, one, option)
+        OptionRow(name, one, option)
         for name, one in model.model_fields.items()
         for option in one.metadata
         if isinstance(option, Option) and place in option.places
@@ -129,8 +129,8 @@ def with_keywords(model: type[BaseModel], place: Place) -> Callable[[FunctionT],
     return decorate
 
 
-def keywords_of(model: type[BaseModel], place: Place) -> list[tuple[Row, str]]:
-    return [(row, type_text(row.field.annotation)) for row in rows(model, place)]
+def keywords_of(model: type[BaseModel], place: Place) -> list[tuple[OptionRow, str]]:
+    return [(row, type_text(row.field.annotation)) for row in option_rows(model, place)]
 
 
 def type_text(annotation: Any) -> str:
@@ -153,7 +153,7 @@ def type_text(annotation: Any) -> str:
     return "Any" if annotation is Any else str(annotation.__name__)
 
 
-def _kind(annotation: Any) -> Any:
+def _value_type(annotation: Any) -> Any:
     while get_origin(annotation) is Annotated:
         annotation = get_args(annotation)[0]
     if get_origin(annotation) in (tuple, dict):
@@ -161,5 +161,5 @@ def _kind(annotation: Any) -> Any:
     members = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
     parts = [one for one in members if one is not type(None)]
     if len(parts) == 1 and parts[0] is not annotation:
-        return _kind(parts[0])
+        return _value_type(parts[0])
     return annotation if annotation in (bool, int, float) or get_origin(annotation) is Literal else str

@@ -16,7 +16,7 @@ from typing import Any, Final, TypeVar
 from graspd.service.model.digests import digest_json, shard_id
 from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest, count_batches
 from graspd.service.model.messages import IngestMessage, TaskMessage
-from graspd.service.model.options import rows
+from graspd.service.model.options import option_rows
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_NETWORKS, SCHEMA_OF_RANGES, TASK_SCHEMA
@@ -86,9 +86,9 @@ def plan_tasks(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedT
             inputs = (output,)
 
 
-def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
+def create_task_message(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
     return TaskMessage(
-        schema_=max(needed_schema(job.request), SCHEMA_OF_RANGES if count_batches(task.count) > 1 else 0),
+        schema_=max(required_schema(job.request), SCHEMA_OF_RANGES if count_batches(task.count) > 1 else 0),
         newest_schema=TASK_SCHEMA,
         task_id=task.id,
         job_id=job.id,
@@ -108,10 +108,10 @@ def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: 
 
 
 #: First schema of each newer option: only jobs with such an option need newer workers.
-_SCHEMAS: Final = {row.name: row.option.schema for row in rows(JobOptions, "job") if row.option.schema}
+_SCHEMAS: Final = {row.name: row.option.schema for row in option_rows(JobOptions, "job") if row.option.schema}
 
 
-def needed_schema(request: JobRequest, since: Mapping[str, int] = _SCHEMAS) -> int:
+def required_schema(request: JobRequest, since: Mapping[str, int] = _SCHEMAS) -> int:
     """Return the oldest schema that can express a request: the schema of its newest option with a value."""
     fields = JobRequest.model_fields
     used = [schema for name, schema in since.items() if getattr(request, name) != fields[name].get_default()]
@@ -145,7 +145,7 @@ def range_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[Sta
     """Return the states of one range's tasks; tasks after a failed or cancelled task are cancelled."""
     states: list[State] = []
     for facts in chain:
-        state = _own_state(facts, job_cancelled=job_cancelled)
+        state = _task_state(facts, job_cancelled=job_cancelled)
         is_blocked = State.FAILED in states or State.CANCELLED in states
         states.append(State.CANCELLED if is_blocked and not state.is_final else state)
     return states
@@ -165,7 +165,7 @@ def job_state(tasks: Iterable[State]) -> State:
     return State.CANCELLED if State.CANCELLED in states else State.SUCCEEDED
 
 
-def _own_state(facts: TaskFacts, *, job_cancelled: bool) -> State:
+def _task_state(facts: TaskFacts, *, job_cancelled: bool) -> State:
     if facts.done:
         return State.SUCCEEDED
     if facts.exhausted and facts.last_attempt > facts.retried_upto:
@@ -203,7 +203,7 @@ class RoundRobin:
         self._served: dict[str, int] = {}
         self._count = 0
 
-    def order(self, jobs: Iterable[WaitingJob], limit: int) -> list[tuple[WaitingJob, int]]:
+    def next_jobs(self, jobs: Iterable[WaitingJob], limit: int) -> list[tuple[WaitingJob, int]]:
         """Return the next jobs, each with its number of tasks to queue; about `limit` tasks in total."""
         of_key: dict[str, list[WaitingJob]] = defaultdict(list)
         for job in sorted(jobs, key=lambda job: self._served.get(f"job {job.id}", 0)):
@@ -280,7 +280,9 @@ def explain_shortfall(
     return f"found {found:,} of {wanted:,} {counted} grasps in {tries:,} candidates{details}"
 
 
-def limit_text(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
+def payload_limit_text(
+    hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None
+) -> str:
     """Describe the payload limit of a hand [kg]; `bound` follows from actuators and friction (inf: none)."""
     most = f", and at most {bound:.2g} kg by actuator effort" if math.isfinite(bound) else ""
     less = "" if wanted is None else f"; {wanted:.3g} kg are wanted"

@@ -33,7 +33,7 @@ class Record(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class Choice(Record):
+class FidelityChoice(Record):
     """Fidelity that a chart selected for `auto`, with the reason."""
 
     target: str = Field(description="required accuracy")
@@ -63,7 +63,7 @@ class JobRecord(Record):
     origin: Origin | None = None
     owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none or unknown")
     project: Project = Field("", description="project of that key; empty: the unnamed project")
-    choice: Choice | None = Field(
+    choice: FidelityChoice | None = Field(
         None, exclude_if=lambda value: value is None, description="fidelity that a chart selected for `auto`"
     )
 
@@ -85,7 +85,7 @@ class JobRecord(Record):
 
     @property
     def assets(self) -> tuple[tuple[AssetKind, str], ...]:
-        further = [(AssetKind.OBJECT, one.digest or "") for one in self.request.beside]
+        further = [(AssetKind.OBJECT, one.digest or "") for one in self.request.all_neighbours]
         further += [(AssetKind.NETWORK, network)] if (network := self.request.network) else []
         return ((AssetKind.HAND, self.hand_digest), (AssetKind.OBJECT, self.object_digest), *further)
 
@@ -116,13 +116,13 @@ class AttemptRecord(Record):
     last: bool
 
     @classmethod
-    def of(cls, message: TaskMessage | IngestMessage, **facts: Any) -> Self:
+    def from_message(cls, message: TaskMessage | IngestMessage, **facts: Any) -> Self:
         """Return the record of the message's attempt, which ends now, with further fields `facts`."""
         facts |= {"task_id": message.task_id, "job_id": getattr(message, "job_id", ""), "ended": timestamp()}
         return cls(stage=message.stage, number=message.attempt, **facts)
 
 
-class Member(Record):
+class DatasetMember(Record):
     """Hand or object of a dataset, in its version at the creation of the dataset."""
 
     name: Name
@@ -134,11 +134,11 @@ class Cell:
     """One hand on one object of a dataset, and its job."""
 
     position: int
-    hand: Member
-    object: Member
+    hand: DatasetMember
+    object: DatasetMember
     job_id: str
     fidelity: str = ""
-    choice: Choice | None = None
+    choice: FidelityChoice | None = None
     """Reason for the chosen fidelity; None also for datasets older than this field."""
 
 
@@ -152,13 +152,13 @@ class DatasetRecord(Record):
     version: Literal[1] = 1
     name: Name
     digest: Digest
-    hands: tuple[Member, ...]
-    objects: tuple[Member, ...]
+    hands: tuple[DatasetMember, ...]
+    objects: tuple[DatasetMember, ...]
     options: JobOptions
     revisions: dict[str, int]
     jobs: tuple[Digest, ...]
     fidelities: tuple[str, ...] = ()
-    choices: tuple[Choice, ...] = Field((), exclude_if=lambda value: not value)
+    choices: tuple[FidelityChoice, ...] = Field((), exclude_if=lambda value: not value)
     chosen: tuple[Annotated[int, Field(ge=0)], ...] = Field((), exclude_if=lambda value: not value)
     created: str
     owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none or unknown")
@@ -237,17 +237,19 @@ class ObjectSet(Record):
     project: Project = ""
 
 
-def request_of(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:
+def create_job_request(options: JobOptions, hand: str, obj: str, fidelity: str = "") -> JobRequest:
     """Return the request of a cell; `fidelity` replaces `auto` and its target."""
     shared = {name: getattr(options, name) for name in JobOptions.model_fields}
     return JobRequest(hand=hand, object=obj, **shared | ({"fidelity": fidelity, "target": ""} if fidelity else {}))
 
 
-def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: str = "", project: str = "") -> JobRecord:
+def create_job_record(
+    cell: Cell, options: JobOptions, revisions: dict[str, int], owner: str = "", project: str = ""
+) -> JobRecord:
     """Return the job of a cell as planned at the creation of the dataset. Jobs of datasets run in bulk."""
     return JobRecord(
         id=cell.job_id,
-        request=request_of(options, cell.hand.name, cell.object.name, cell.fidelity),
+        request=create_job_request(options, cell.hand.name, cell.object.name, cell.fidelity),
         revisions=revisions,
         hand_digest=cell.hand.digest,
         object_digest=cell.object.digest,
@@ -259,7 +261,7 @@ def job_of(cell: Cell, options: JobOptions, revisions: dict[str, int], owner: st
     )
 
 
-def object_set_of(
+def create_object_set(
     name: str, objects: Iterable[str], *, after: str = "", owner: str = "", project: str = ""
 ) -> ObjectSet:
     """Return a version of a set; its digest includes `after`, the digest of the previous version."""

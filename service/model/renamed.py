@@ -58,14 +58,14 @@ def convert_names(value: Any) -> Any:
 
 def convert_chart(chart: Any) -> Any:
     """Convert a chart of `graspd chart` to present names."""
-    return _measures(convert_names(chart))
+    return _convert_measures(convert_names(chart))
 
 
-def _measures(value: Any) -> Any:
+def _convert_measures(value: Any) -> Any:
     if isinstance(value, dict):
-        return {_chart_name(key): _measures(inner) for key, inner in value.items()}
+        return {_chart_name(key): _convert_measures(inner) for key, inner in value.items()}
     if isinstance(value, list):
-        return [_chart_name(inner) if isinstance(inner, str) else _measures(inner) for inner in value]
+        return [_chart_name(inner) if isinstance(inner, str) else _convert_measures(inner) for inner in value]
     return value
 
 

@@ -187,19 +187,19 @@ SHELF_HEIGHT: Final = 0.35
 UPRIGHT: Final = 1 - 1e-6
 
 
-def supports_in(spec: SceneSpec) -> tuple[HalfSpace | Box, ...]:
+def scene_supports(spec: SceneSpec) -> tuple[HalfSpace | Box, ...]:
     if spec.kind == "free":
         return ()
     if spec.kind == "file":
         return spec.supports
     if spec.kind == "table":
         return (HalfSpace(),)
-    return _bin() if spec.kind == "bin" else _shelf()
+    return _bin_supports() if spec.kind == "bin" else _shelf_supports()
 
 
 def has_table(spec: SceneSpec) -> bool:
     """Check whether a support is a level half-space."""
-    flat = (one for one in supports_in(spec) if isinstance(one, HalfSpace))
+    flat = (one for one in scene_supports(spec) if isinstance(one, HalfSpace))
     return any(one.normal[2] / math.hypot(*one.normal) > UPRIGHT for one in flat)
 
 
@@ -207,7 +207,7 @@ def _box(x: float, y: float, z: float, size: tuple[float, float, float]) -> Box:
     return Box(size=size, pose=(x, y, z, 1.0, 0.0, 0.0, 0.0))
 
 
-def _bin() -> tuple[HalfSpace | Box, ...]:
+def _bin_supports() -> tuple[HalfSpace | Box, ...]:
     (x, y), z = BIN_SIZE, BIN_HEIGHT / 2
     along, across = (WALL, y + 2 * WALL, BIN_HEIGHT), (x, WALL, BIN_HEIGHT)
     ends = [_box(s * (x + WALL) / 2, 0, z, along) for s in (-1, 1)]
@@ -215,7 +215,7 @@ def _bin() -> tuple[HalfSpace | Box, ...]:
     return (HalfSpace(), *ends, *sides)
 
 
-def _shelf() -> tuple[HalfSpace | Box, ...]:
+def _shelf_supports() -> tuple[HalfSpace | Box, ...]:
     width, depth = SHELF_SIZE
     board = (depth, width, WALL)
     return (
@@ -268,7 +268,7 @@ SceneOption = Annotated[
 ]
 
 
-def scene_of(
+def build_scene_spec(
     option: str | SceneDocument,
     *,
     faces: Literal["drawn", "all"] = "drawn",
@@ -294,7 +294,7 @@ def check_object_name(text: str) -> str:
     return text
 
 
-def scene_option(
+def parse_scene_option(
     text: str, *, beside: Path | None = None, named: Callable[[str], str] = check_object_name
 ) -> str | dict[str, Any]:
     """Return the scene of a request: a kind, or the content of a scene file relative to folder `beside`.

@@ -56,31 +56,31 @@ class StabilityMap:
     reach: str = ""
     """Which cells a job can reach, with the reason."""
 
-    def share(self, panel: str) -> float:
-        cells = self.of(panel)
+    def good_share(self, panel: str) -> float:
+        cells = self.panel_cells(panel)
         return sum(cell.outcome == "good" for cell in cells) / max(1, len(cells))
 
     @property
     def panels(self) -> list[str]:
         return list(dict.fromkeys(cell.panel for cell in self.cells))
 
-    def of(self, panel: str) -> list[MapCell]:
+    def panel_cells(self, panel: str) -> list[MapCell]:
         return [cell for cell in self.cells if cell.panel == panel]
 
     def reached(self) -> list[MapCell]:
         return [cell for cell in self.cells if cell.reached]
 
     @property
-    def is_divided(self) -> bool:
+    def is_partly_reachable(self) -> bool:
         """Whether jobs can reach some cells, but not all."""
         return 0 < len(self.reached()) < len(self.cells)
 
-    def still_breaks(self) -> list[str]:
+    def broken_cell_lines(self) -> list[str]:
         """Return a line per panel with broken cells that jobs can reach: `PANEL X, X (Y, Y); ...`."""
         lines = []
         for panel in self.panels:
             by_x: dict[float | str, list[str]] = defaultdict(list)
-            for cell in self.of(panel):
+            for cell in self.panel_cells(panel):
                 if cell.reached and cell.outcome == "broken":
                     by_x[cell.x].append(format_tick(cell.y))
             by_y: dict[str, list[str]] = defaultdict(list)
@@ -99,16 +99,16 @@ class Stability:
     maps: list[StabilityMap]
 
     def as_json(self) -> dict[str, Any]:
-        """Return a JSON object; None replaces nan and infinity, and `from_json` reads None as nan."""
+        """Return a JSON object; None replaces nan and infinity, and `parse_stability` reads None as nan."""
         return dict(json_value(asdict(self)))
 
 
-def from_json(record: Mapping[str, Any]) -> Stability:
+def parse_stability(record: Mapping[str, Any]) -> Stability:
     """Read a record of `as_json`; ValueError if it is invalid."""
     return _RECORD.validate_python(record)
 
 
-def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
+def pareto_front(points: Sequence[tuple[float, float]]) -> set[int]:
     """Return indices of points that no other point dominates; more is better in both coordinates."""
     return {i for i, (x, y) in enumerate(points) if not any(a >= x and b >= y and (a, b) != (x, y) for a, b in points)}
 

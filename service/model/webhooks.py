@@ -49,7 +49,7 @@ def check_url(url: str) -> str:
     return url
 
 
-def secret_of(master: str, webhook: str) -> str:
+def derive_secret(master: str, webhook: str) -> str:
     """Derive the secret that signs the bodies of a webhook from the secret `master`."""
     return "whsec_" + hmac.new(master.encode(), f"webhook {webhook}".encode(), hashlib.sha256).hexdigest()
 

@@ -83,7 +83,7 @@ def parse_where(text: str) -> Node:
     """Parse an expression to a tree; InputError quotes the mistake or lists the known names."""
     if len(text) > LONGEST:
         raise InputError(f"the expression is {len(text)} characters long; at most {LONGEST} are allowed")
-    parser = _Parser(_tokens(text))
+    parser = _Parser(_tokenize(text))
     found = parser.expression(0)
     if rest := parser.tokens[parser.at :]:
         raise InputError(f"{rest[0].text!r} follows a complete expression; join conditions by `and` or `or`")
@@ -96,7 +96,7 @@ class _Token:
     text: str
 
 
-def _tokens(text: str) -> list[_Token]:
+def _tokenize(text: str) -> list[_Token]:
     found, at = [], 0
     while at < len(text.rstrip()):
         match = _TOKEN.match(text, at)

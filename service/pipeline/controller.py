@@ -15,16 +15,16 @@ from dataclasses import dataclass
 from typing import Final
 
 from graspd.service.index.notes import StoreMark
-from graspd.service.index.rebuild import complete_if_new, rebuild
+from graspd.service.index.rebuild import mark_complete_if_new, rebuild
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import BusyError, DamagedError, NotFoundError, StoreUnavailable, UnavailableError
-from graspd.service.model.messages import WorkerBeat, requirements_of
+from graspd.service.model.messages import WorkerHeartbeat, requirements_of
 from graspd.service.model.planning import RoundRobin, ingest_id, ingest_message
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import Priority
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.datasets.actions import DatasetRounds
+from graspd.service.pipeline.datasets.actions import DatasetController
 from graspd.service.pipeline.deletion import GarbageCollector
 from graspd.service.pipeline.identity import identify
 from graspd.service.pipeline.indexer import Indexer
@@ -35,7 +35,7 @@ from graspd.service.pipeline.lease_reaper import LeaseReaper
 from graspd.service.pipeline.webhook_dispatcher import WebhookDispatcher
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.library import publish_builtins, stored_assets
-from graspd.service.store.packs import unpack_all
+from graspd.service.store.packs import convert_packs
 from graspd.service.store.records import newest_mark, next_mark, read_record, set_mark
 from graspd.service.telemetry import HeartbeatFile
 
@@ -67,7 +67,7 @@ class Controller:
         self._services = services
         self._indexer = Indexer(services)
         self._reaper = LeaseReaper(services, self._indexer, clock=clock)
-        self._planner = DatasetRounds(services, clock=clock)
+        self._planner = DatasetController(services, clock=clock)
         self._garbage = GarbageCollector(services, clock=clock)
         self._known: str | None = None
         """Mark of the index when it last matched the store's mark."""
@@ -75,7 +75,7 @@ class Controller:
         self._turns = RoundRobin()
         self._backlog: list[tuple[str, Event]] = []
         self._routes = Routes()
-        self._seen: dict[str, tuple[float, WorkerBeat]] = {}
+        self._seen: dict[str, tuple[float, WorkerHeartbeat]] = {}
         self._held: set[str] = set()
         self._has_news = False
         """Whether events arrived since the last fill of the queue."""
@@ -90,24 +90,24 @@ class Controller:
         self._entered = ""
         self._identify = PeriodicDuty(clock, lambda: identify(services, holds_redis=True), _IDENTIFY_EVERY_S)
         self._duties = [
-            PeriodicDuty(clock, services.queue.tidy, _WORKERS_EVERY_S),
-            PeriodicDuty(clock, self._mark, _WORKERS_EVERY_S),
+            PeriodicDuty(clock, services.queue.remove_stale_keys, _WORKERS_EVERY_S),
+            PeriodicDuty(clock, self._renew_mark, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._indexer.flush, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._check_workers, _WORKERS_EVERY_S, share=0.1),
             # Each lease is checked at least three times before it counts as lost.
             PeriodicDuty(clock, self._reconcile_queue, interval_s, longest_s=services.settings.lease_s / 3),
-            PeriodicDuty(clock, self._feed_new, 0.0),
+            PeriodicDuty(clock, self._queue_new_tasks, 0.0),
             PeriodicDuty(clock, self._publish_progress, min(_PROGRESS_EVERY_S, interval_s), share=0.1),
             # The index is unlocked for at least as long as it was locked.
             PeriodicDuty(clock, self._enter_large_job, _ENTERING_GAP_S, share=0.5),
-            PeriodicDuty(clock, self._plan, interval_s),
-            PeriodicDuty(clock, lambda: self._garbage.advance() or self._garbage.collect(), _COLLECT_EVERY_S),
+            PeriodicDuty(clock, self._plan_datasets, interval_s),
+            PeriodicDuty(clock, lambda: self._garbage.execute_deletions() or self._garbage.collect(), _COLLECT_EVERY_S),
         ]
 
     def run(self, stop: threading.Event) -> None:
         """Run rounds until `stop` is set; wait with growing pauses for an unavailable backend."""
         with self._background_duties(stop):
-            self._run(stop)
+            self._run_rounds(stop)
 
     @contextmanager
     def _background_duties(self, stop: threading.Event) -> Iterator[None]:
@@ -125,13 +125,13 @@ class Controller:
             for thread in threads:
                 thread.join(_LAST_READ_S)
 
-    def _run(self, stop: threading.Event) -> None:
+    def _run_rounds(self, stop: threading.Event) -> None:
         pause = 0.0
         while not stop.is_set():
             # The heartbeat continues while a backend is unavailable, because a restart would not help.
             self._alive.touch()
             try:
-                self.round(wait_s=self._services.settings.controller_interval_s)
+                self.run_round(wait_s=self._services.settings.controller_interval_s)
                 pause = 0.0
             except BusyError:
                 raise  # Another service has taken over the store.
@@ -145,9 +145,9 @@ class Controller:
                 stop.wait(pause)
         if self._started:
             with _log_failures([]):
-                self._mark()
+                self._renew_mark()
 
-    def round(self, *, wait_s: float = 0.0) -> None:
+    def run_round(self, *, wait_s: float = 0.0) -> None:
         """Index new events, then run due duties; BusyError if another service has taken over the store."""
         self._identify()
         self._ensure_index()
@@ -160,10 +160,10 @@ class Controller:
         if away:
             raise away[0]
 
-    def _mark(self) -> None:
+    def _renew_mark(self) -> None:
         """After changes, give index and store a new common mark, by which an older copy of either is detected."""
         notes = self._services.index.notes
-        present, changes = notes.store_mark(), notes.changes()
+        present, changes = notes.store_mark(), notes.change_count()
         if changes != present.changes or self._made:
             fresh = next_mark(present.mark)
             notes.set_store_mark(StoreMark(fresh, newest_mark(self._services.store), changes))
@@ -179,7 +179,7 @@ class Controller:
             self._services.index.live.set_progress(changed)
         self._progress = found
 
-    def _plan(self) -> bool:
+    def _plan_datasets(self) -> bool:
         self._has_plans = self._planner.advance()
         return self._has_plans
 
@@ -193,7 +193,7 @@ class Controller:
             record = read_record(JobRecord, self._services.store, names.job_record_key(self._entered))
         except (NotFoundError, DamagedError) as error:
             log.error("the remaining tasks of job %s are not entered: %s", self._entered, error)
-        self._services.index.write.enter_more(self._entered, record)
+        self._services.index.write.enter_next_tasks(self._entered, record)
 
     def _check_workers(self) -> None:
         self._announce()
@@ -205,7 +205,7 @@ class Controller:
         self._seen = {name: one for name, one in self._seen.items() if now - one[0] < _REMEMBERED_S}
         known = [beat for _, beat in self._seen.values()]
         self._routes = Routes(known)
-        self._services.queue.clear_untaken(known)
+        self._services.queue.remove_unserved_lists(known)
         # A worker that ends is unregistered shortly before its event arrives: only a longer silence means a loss.
         lost, forgotten = timestamp(self._services.settings.lease_s), timestamp(_FORGET_WORKERS_AFTER_S)
         self._services.index.live.set_workers(present, lost_before=lost, forget_before=forgotten)
@@ -219,10 +219,10 @@ class Controller:
 
     def _start(self) -> None:
         publish_builtins(self._services.store)
-        for manifest in unpack_all(self._services.store):
+        for manifest in convert_packs(self._services.store):
             self._alive.touch()
             self._indexer.index_shard(manifest)
-        complete_if_new(self._services.index, self._services.store)
+        mark_complete_if_new(self._services.index, self._services.store)
         made = self._services.index.notes.completeness()
         # Records that an earlier rebuild omitted may have been repaired.
         if made is None or made.left_out or self._is_stale():
@@ -234,7 +234,7 @@ class Controller:
     def _is_stale(self) -> bool:
         """Return whether index or store was replaced by an older copy; if so, mark the index as incomplete."""
         present = self._services.index.notes.store_mark()
-        # After a kill between the writes of `_mark`, the store has the previous mark.
+        # After a kill between the writes of `_renew_mark`, the store has the previous mark.
         if present.mark == self._known or newest_mark(self._services.store) in (present.mark, present.before):
             self._known = present.mark
             return False
@@ -249,7 +249,7 @@ class Controller:
     def _index_assets(self) -> None:
         for kind, digest in stored_assets(self._services.store):
             try:
-                self._indexer.checked(kind, digest)
+                self._indexer.index_asset(kind, digest)
             except DamagedError as error:
                 log.warning("%s", error)
 
@@ -276,20 +276,20 @@ class Controller:
         # While Redis refuses writes, workers cannot send heartbeats: this write fails first, so none counts as lost.
         self._announce()
         # Waiting tasks are read before leases: a task that is taken in between then counts as leased.
-        waiting = self._services.queue.waiting()
+        waiting = self._services.queue.waiting_tasks()
         leases = self._services.queue.leases()
         lost = self._reaper.reap(leases)
         present = waiting | {lease.task_id for lease in leases if lease not in lost}
-        if stray := self._services.index.feed.cancelled(present):
+        if stray := self._services.index.feed.cancelled_tasks(present):
             self._services.queue.discard(stray)
         missing = {*self._reaper.find_missing(present), *(lease.task_id for lease in lost)}
-        self._feed(present, missing)
+        self._queue_ready_tasks(present, missing)
 
-    def _feed_new(self) -> None:
+    def _queue_new_tasks(self) -> None:
         if self._has_news:
-            self._feed()
+            self._queue_ready_tasks()
 
-    def _feed(self, present: set[str] | None = None, missing: Collection[str] = ()) -> None:
+    def _queue_ready_tasks(self, present: set[str] | None = None, missing: Collection[str] = ()) -> None:
         """Queue ready tasks that are not in `present`, the queue's content (None: use the index's marks).
 
         The queue refuses a second entry of a task, except of `missing` tasks.
@@ -314,15 +314,15 @@ class Controller:
         for why in sorted(held - self._held):
             log.warning("tasks are %s", why)
         self._held = held
-        self._feed_checks(present, missing, now)
+        self._queue_checks(present, missing, now)
         self._has_news = False
 
-    def _feed_checks(self, present: set[str] | None, missing: Collection[str], now: float) -> None:
+    def _queue_checks(self, present: set[str] | None, missing: Collection[str], now: float) -> None:
         for check in self._services.index.feed.ready_checks(now=now, limit=self._services.settings.queue_window):
             self._services.index.live.set_asset_waiting([check.digest], queued=True)
             if self._services.store.exists(names.asset_check_key(check.kind, check.digest)):
                 with _log_failures([]):
-                    self._indexer.checked(check.kind, check.digest)
+                    self._indexer.index_asset(check.kind, check.digest)
             elif ingest_id(check.kind, check.digest) not in (present or ()):
                 numbers = {"attempt": check.last_attempt + 1, "max_attempt": self._services.settings.task_attempts}
                 message = ingest_message(check.kind, check.name, check.digest, **numbers)

@@ -34,14 +34,14 @@ from graspd.service.store.records import (
     Put,
     What,
     dataset_events,
-    deletions,
+    is_removed_before,
     job_events,
     load_dataset,
     put_record,
     read_record,
     released_key,
-    removed_before,
     removed_folder,
+    restorable_deletions,
 )
 from graspd.service.store.store import Store
 
@@ -67,7 +67,7 @@ def delete_asset(
                 user = "a job, a dataset or a set of objects"
             raise ConflictError(f"the {kind.value} {asset.name!r} is needed by {user}; delete that first")
         about = {"name": asset.name, "submitter": asset.owner, "project": asset.project}
-        _put(put, what=kind.value, id=asset.digest, owner=owner, **about)
+        _put_deletion(put, what=kind.value, id=asset.digest, owner=owner, **about)
         services.index.removals.remove_asset(kind, asset.digest, within=connection)
 
 
@@ -83,7 +83,7 @@ def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
             raise ConflictError(f"job {job_id} {user}")
         attempts = services.index.removals.attempts_of(job_id, within=connection)
         about = {"name": f"{job.request.hand} on {job.request.object}", "submitter": job.owner, "project": job.project}
-        _put(put, what="job", id=job_id, owner=owner, job=record, attempts=attempts, **about)
+        _put_deletion(put, what="job", id=job_id, owner=owner, job=record, attempts=attempts, **about)
         services.index.removals.remove_job(job_id, within=connection)
 
 
@@ -99,13 +99,13 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
                 f"dataset {name!r} has {taken} snapshot{'s' * (taken > 1)}, which papers and training runs may name; "
                 f"to delete them too: graspd datasets delete {name} --with-snapshots"
             )
-        _put(put, what="dataset", id=name, owner=owner, submitter=dataset.owner, project=dataset.project)
+        _put_deletion(put, what="dataset", id=name, owner=owner, submitter=dataset.owner, project=dataset.project)
         services.index.removals.remove_dataset(name, within=connection)
 
 
 def move_to_removed(services: Services, deletion: Deletion) -> None:
     """Move a deleted resource's stored objects below `removed/`, record last, unless it was restored."""
-    record = _record_of(deletion)
+    record = _record_key(deletion)
     with services.index.database.write_transaction():
         if not services.store.exists(names.deletion_key(deletion.what, deletion.id)):
             return
@@ -132,7 +132,7 @@ def restore(
     `permit` raises if the user may not restore it; `among` tests the scope. NotFoundError: nothing of this name was
     deleted within the grace time. ConflictError: the name is in use again, or an asset that it needs is deleted.
     """
-    known = [one for one in deletions(services.store, what) if name in (one.id, one.name) and among(one)]
+    known = [one for one in restorable_deletions(services.store, what) if name in (one.id, one.name) and among(one)]
     if not known:
         days = services.settings.shard_grace_s / 86400
         raise NotFoundError(f"no {what} {name!r} was deleted in the last {days:.3g} days")
@@ -148,7 +148,7 @@ def restore(
 
 def _restore(services: Services, deletion: Deletion, connection: Connection) -> None:
     """Restore stored objects, then rows, then remove the deletion record; call within a write transaction."""
-    store, record, folder = services.store, _record_of(deletion), removed_folder(deletion)
+    store, record, folder = services.store, _record_key(deletion), removed_folder(deletion)
     waiting = names.deletion_key(deletion.what, deletion.id)
     if not store.exists(waiting) and store.exists(record):
         called = deletion.id if deletion.what in ("job", "dataset") else deletion.name
@@ -173,7 +173,7 @@ def _restore_rows(services: Services, deletion: Deletion, connection: Connection
     store, index = services.store, services.index
     if deletion.what == "job":
         record = read_record(JobRecord, store, names.job_record_key(deletion.id))
-        _require(services, record.assets, connection)
+        _require_assets(services, record.assets, connection)
         index.write.add_job(record, within=connection)
         tried = [read_record(AttemptRecord, store, names.attempt_key(*one)) for one in deletion.attempts]
         for attempt in sorted(tried, key=lambda one: one.number):
@@ -183,7 +183,7 @@ def _restore_rows(services: Services, deletion: Deletion, connection: Connection
     elif deletion.what == "dataset":
         dataset = load_dataset(store, deletion.id)
         members = [(AssetKind.HAND, one.digest) for one in dataset.hands]
-        _require(services, [*members, *((AssetKind.OBJECT, one.digest) for one in dataset.objects)], connection)
+        _require_assets(services, [*members, *((AssetKind.OBJECT, one.digest) for one in dataset.objects)], connection)
         index.write_dataset.add(dataset, within=connection)
         index.write_dataset.set_events(dataset.name, dataset_events(store, dataset.name), within=connection)
         for key in _keys_below(store, names.dataset_snapshots_folder(dataset.name)):
@@ -202,7 +202,7 @@ def _restore_jobs(services: Services, deletion: Deletion, connection: Connection
     """Restore the jobs of a dataset that were deleted with it or later."""
     wanted = set(load_dataset(services.store, deletion.id).jobs)
     newest: dict[str, Deletion] = {}
-    for one in deletions(services.store, "job"):
+    for one in restorable_deletions(services.store, "job"):
         if one.id in wanted and one.at >= deletion.at:
             newest.setdefault(one.id, one)
     for one in newest.values():
@@ -219,13 +219,13 @@ def _restore_tag(services: Services, deletion: Deletion) -> None:
         services.store.delete(done)
 
 
-def _require(services: Services, wanted: Collection[tuple[AssetKind, str]], connection: Connection) -> None:
+def _require_assets(services: Services, wanted: Collection[tuple[AssetKind, str]], connection: Connection) -> None:
     if missing := services.index.assets.missing(wanted, within=connection):
         kind = missing[0].partition(" ")[0]
         raise ConflictError(f"it needs the {missing[0]}, which was deleted too; first run `graspd {kind}s restore`")
 
 
-def _record_of(deletion: Deletion) -> str:
+def _record_key(deletion: Deletion) -> str:
     """Return the key of the record whose presence makes the resource exist."""
     if deletion.what == "job":
         return names.job_record_key(deletion.id)
@@ -242,7 +242,7 @@ def _record_last(keys: Iterable[str], record: str) -> list[str]:
     return sorted(keys, key=lambda key: (key == record, key))
 
 
-def _put(put: Put, **values: Any) -> None:
+def _put_deletion(put: Put, **values: Any) -> None:
     deletion = Deletion(at=timestamp(), **values)
     put(names.deletion_key(deletion.what, deletion.id), deletion)
 
@@ -254,10 +254,10 @@ class GarbageCollector:
         self._services = services
         self._clock = clock
 
-    def advance(self, budget_s: float = BUDGET_S) -> bool:
+    def execute_deletions(self, budget_s: float = BUDGET_S) -> bool:
         """Execute deletions for about `budget_s` [s]; return whether work is left."""
         deadline = self._clock() + budget_s
-        for _, deletion in self._records(Deletion, names.DELETIONS):
+        for _, deletion in self._read_records(Deletion, names.DELETIONS):
             if self._clock() > deadline or not self._execute(deletion, deadline):
                 return True
             log.info("the stored objects of %s %s are moved to removed/", deletion.what, deletion.id)
@@ -272,22 +272,22 @@ class GarbageCollector:
         for key in sorted(removed, key=lambda key: key.endswith("/deletion.json")):
             if self._clock() > deadline:
                 return True
-            if removed_before(key, before):
+            if is_removed_before(key, before):
                 self._services.store.delete(key)
         known = self._services.index.notes.completeness()
         if known is not None and known.left_out:
             return False  # A job with an unreadable record may need one of these shards.
-        for key, released in self._records(DeletedJob, names.RELEASED):
+        for key, released in self._read_records(DeletedJob, names.RELEASED):
             if released.at > before:
                 break  # The keys begin with the time, so all further records are younger.
-            for stage, shard in self._unneeded(released):
+            for stage, shard in self._unneeded_shards(released):
                 if self._clock() > deadline:
                     return True
                 self._remove_shard(stage, shard)
             self._services.store.delete(key)
         return False
 
-    def _records(self, model: type[RecordT], folder: str) -> Iterator[tuple[str, RecordT]]:
+    def _read_records(self, model: type[RecordT], folder: str) -> Iterator[tuple[str, RecordT]]:
         """Yield key and content of the readable records below a folder, ordered by key."""
         for key in sorted(entry.key for entry in self._services.store.list(folder)):
             try:
@@ -331,7 +331,7 @@ class GarbageCollector:
                     log.info("job %s of the deleted dataset %s stays: %s", job, dataset, error)
         return True
 
-    def _unneeded(self, released: DeletedJob) -> Iterator[tuple[Stage, str]]:
+    def _unneeded_shards(self, released: DeletedJob) -> Iterator[tuple[Stage, str]]:
         planned = [(task.stage, task.output) for task in plan_tasks(released.job)]
         for some in chunks(planned, _AT_ONCE):
             unneeded = self._services.index.removals.unneeded_shards([shard for _, shard in some])

@@ -11,11 +11,11 @@ from typing import Any, Final, Literal, NamedTuple
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import AUTO, OFFERED
-from graspd.service.model.records import Choice
+from graspd.service.model.records import FidelityChoice
 from graspd.service.model.renamed import convert_chart
 from graspd.service.model.studies import FREE, IN_SCENE, IN_SCENES, SPEEDS
 from graspd.service.store.integrity import get_document
-from graspd.service.store.records import latest_key, scene_chart_kind
+from graspd.service.store.records import latest_record_key, scene_chart_kind
 from graspd.service.store.store import Store
 
 Row = Mapping[str, Any]
@@ -54,7 +54,7 @@ class _Chart:
         return {hand for hand, _ in self.pairs}
 
 
-class Resolver:
+class FidelityResolver:
     """Replaces the fidelity `auto`, by the newest chart of free objects or of the kind of scene."""
 
     def __init__(self, store: Store) -> None:
@@ -65,7 +65,7 @@ class Resolver:
         """Return the request with `auto` replaced by a fidelity; errors as in `choose`."""
         return self.choose(request)[0]
 
-    def choose(self, request: JobRequest) -> tuple[JobRequest, Choice | None]:
+    def choose(self, request: JobRequest) -> tuple[JobRequest, FidelityChoice | None]:
         """Return the request with `auto` replaced, and how (None: unchanged); InputError without a match."""
         if request.fidelity != AUTO:
             return request, None
@@ -79,12 +79,12 @@ class Resolver:
             chart.found[key] = cheapest_fidelity(chart.content, target, method=method, hand=hand, object_=object_)
         found = chart.found[key]
         reached = round(found.reached, 4)
-        how = Choice(target=request.target, chart=chart.key, measured_on=found.measured_on, reached=reached)
+        how = FidelityChoice(target=request.target, chart=chart.key, measured_on=found.measured_on, reached=reached)
         return request.model_copy(update={"fidelity": found.fidelity, "target": ""}), how
 
     def _chart(self, request: JobRequest) -> _Chart:
         if request.scene not in self._charts:
-            key = latest_key(self._store, scene_chart_kind(request.place))
+            key = latest_record_key(self._store, scene_chart_kind(request.scene_spec))
             if not key:
                 raise InputError(_no_chart_text(request))
             self._charts[request.scene] = _Chart(key, convert_chart(get_document(self._store, key)))
@@ -94,7 +94,7 @@ class Resolver:
 def _no_chart_text(request: JobRequest) -> str:
     if not request.in_scene:
         return "fidelity auto needs a chart: run `graspd chart --publish` once, or name a fidelity"
-    scene = request.place.kind
+    scene = request.scene_spec.kind
     asked, named = ("FILE", "of a scene file with the same supports") if scene == "file" else (scene, f"in a {scene}")
     return (
         f"fidelity auto needs a chart of scenes, here {named}, because charts of free objects have no lifts: run "
@@ -130,12 +130,12 @@ def cheapest_fidelity(chart: Row, target: str, *, method: str, hand: str, object
     runs = [run for run in runs if run.get("way", IN_SCENE) == IN_SCENE]
     if not runs:
         raise InputError(f"the stored chart has no run of {method}; run {again}, or name a fidelity")
-    found = _nearest(runs, metric, {"hand": hand, "object": object_})
+    found = _most_similar_runs(runs, metric, {"hand": hand, "object": object_})
     if found is None:
         raise InputError(f"the stored chart lacks {metric} of {method}; run {again}, or ask for another target")
     measured_on, near = found
     names = dict.fromkeys(run["fidelity"] for run in near)
-    means = {name: (_speed(near, name), _mean(near, name, metric)) for name in names}
+    means = {name: (_mean_speed(near, name), _mean_metric(near, name, metric)) for name in names}
     known = {name: (speed, value) for name, (speed, value) in means.items() if value is not None}
     good = [name for name, (_, value) in known.items() if (value >= bound if more else value <= bound)]
     if not good:
@@ -145,7 +145,7 @@ def cheapest_fidelity(chart: Row, target: str, *, method: str, hand: str, object
     return ChosenFidelity(chosen, measured_on, known[chosen][1])
 
 
-def _nearest(runs: Sequence[Row], metric: str, wanted: Mapping[str, str]) -> tuple[Near, list[Row]] | None:
+def _most_similar_runs(runs: Sequence[Row], metric: str, wanted: Mapping[str, str]) -> tuple[Near, list[Row]] | None:
     """Return the most similar runs that include `metric`, with the kind of similarity; None without any."""
     for measured_on, same in _NEAR:
         near = [run for run in runs if all(run[name] == wanted[name] for name in same)]
@@ -154,13 +154,13 @@ def _nearest(runs: Sequence[Row], metric: str, wanted: Mapping[str, str]) -> tup
     return None
 
 
-def _speed(runs: Sequence[Row], fidelity: str) -> float:
+def _mean_speed(runs: Sequence[Row], fidelity: str) -> float:
     """Return the mean speed of a fidelity's runs; a run without a speed counts as 0."""
     own = [run for run in runs if run["fidelity"] == fidelity]
     return sum(float(next((run[key] for key in SPEEDS if key in run), None) or 0.0) for run in own) / len(own)
 
 
-def _mean(runs: Sequence[Row], fidelity: str, metric: str) -> float | None:
+def _mean_metric(runs: Sequence[Row], fidelity: str, metric: str) -> float | None:
     """Return the mean of a metric over the runs of a fidelity that have a value; None without any."""
     values = [float(run[metric]) for run in runs if run["fidelity"] == fidelity and run.get(metric) is not None]
     return sum(values) / len(values) if values else None

@@ -38,7 +38,7 @@ class ServiceRecord(Record):
 
 
 @dataclass(frozen=True)
-class Identity:
+class ServiceIdentity:
     """Service ids in store (`chain`, the last one applies), index, Redis and data folder."""
 
     chain: Sequence[str]
@@ -86,30 +86,30 @@ def identify(
     BusyError: a backend belongs to another service.
     """
     # Redis is read first, so that concurrent new processes see each other's writes.
-    redis = services.queue.service() if ask_redis else None
+    redis = services.queue.service_id() if ask_redis else None
     left = recorded_service(folder)
     chain = service_ids(services.store)
-    index = services.index.notes.service()
+    index = services.index.notes.service_id()
     if not chain:
         # An incomplete index may remain from a first start that was killed.
         if index is not None and not take_over and services.index.notes.completeness() is not None:
             raise BusyError(_foreign_index_error(services.store.url))
-        index = services.index.notes.name_service(index or secrets.token_hex(_BYTES))
+        index = services.index.notes.set_service_id(index or secrets.token_hex(_BYTES))
         if redis not in (None, index) and not holds_redis:
             raise BusyError(_REDIS)
-        _add(services.store, 1, index)
+        _add_service_record(services.store, 1, index)
         chain = service_ids(services.store)
     foreign = holds_redis and redis not in chain
-    found = Identity(chain, index, None if foreign else redis, left, services.settings.store_url is None)
+    found = ServiceIdentity(chain, index, None if foreign else redis, left, services.settings.store_url is None)
     if why := found.refusal(services.store.url, take_over=take_over):
         raise BusyError(why)
     if take_over and not found.is_same:
-        _add(services.store, len(chain) + 1, secrets.token_hex(_BYTES))
+        _add_service_record(services.store, len(chain) + 1, secrets.token_hex(_BYTES))
         chain = service_ids(services.store)
-    mine = services.index.notes.name_service(chain[-1], instead=take_over)
+    mine = services.index.notes.set_service_id(chain[-1], instead=take_over)
     if ask_redis and redis != mine:
-        services.queue.set_service(mine, instead=redis is not None)
-        if not holds_redis and services.queue.service() not in chain:
+        services.queue.set_service_id(mine, instead=redis is not None)
+        if not holds_redis and services.queue.service_id() not in chain:
             raise BusyError(_REDIS)
     if folder is not None and left != mine:
         (folder / _FILE).write_text(mine)
@@ -150,5 +150,5 @@ def _foreign_index_error(store: str) -> str:
     )
 
 
-def _add(store: Store, number: int, identity: str) -> None:
+def _add_service_record(store: Store, number: int, identity: str) -> None:
     put_record(store, names.service_key(number), ServiceRecord(id=identity, at=timestamp()))

@@ -42,7 +42,7 @@ class Indexer:
         self._services = services
         self._told: OrderedDict[str, State] = OrderedDict()
         self._deferrals: dict[str, int] = {}
-        self._tally = Tally(services.queue.count)
+        self._tally = Tally(services.queue.add_to_counters)
         self._readers = ThreadPoolExecutor(_READERS, thread_name_prefix="manifests")
 
     def apply(self, events: Sequence[Event]) -> list[int]:
@@ -60,25 +60,25 @@ class Indexer:
             elif event.kind is EventKind.LEFT:
                 left.append(event.worker)
             elif event.kind is not EventKind.JOB:
-                self._start(started)
+                self._mark_running(started)
                 # While the store is unavailable, only events that do not need it are applied.
-                if not (waiting and event.kind in _NEEDS_STORE) and self._apply(event):
+                if not (waiting and event.kind in _NEEDS_STORE) and self._apply_event(event):
                     continue
                 waiting.append(place)
-        self._start(started)
-        waiting += self._finish(events, finished)
+        self._mark_running(started)
+        waiting += self._index_finished_tasks(events, finished)
         if left:
-            self._services.index.live.forget_workers(left)
+            self._services.index.live.delete_workers(left)
         return sorted(waiting)
 
-    def _start(self, started: dict[str, str]) -> None:
+    def _mark_running(self, started: dict[str, str]) -> None:
         """Mark tasks, mapped to their workers, as running; then clear the mapping."""
         if started:
             with _skip_invalid(f"the start of {len(started)} tasks"):
                 self.publish_states(self._services.index.live.set_running(started))
             started.clear()
 
-    def _finish(self, events: Sequence[Event], places: Sequence[int]) -> list[int]:
+    def _index_finished_tasks(self, events: Sequence[Event], places: Sequence[int]) -> list[int]:
         """Index the shards of finished tasks; return the positions of events that must wait for the store."""
         made, waiting = list[ShardManifest](), []
         for place, found in self._load_manifests(events, places):
@@ -86,7 +86,7 @@ class Indexer:
                 self._deferrals.pop(events[place].task_id, None)
                 made.append(found)
                 if sum(manifest.batches for manifest in made) >= _BATCHES_AT_ONCE:
-                    self._index(made)
+                    self._index_manifests(made)
                     made = []
             elif isinstance(found, StoreUnavailable):
                 waiting.append(place)
@@ -94,16 +94,16 @@ class Indexer:
                 log.error("the end of task %s is not indexed", events[place].task_id, exc_info=found)
         if waiting:
             log.warning("the store does not answer, and %d events wait for it", len(waiting))
-        self._index(made)
+        self._index_manifests(made)
         return waiting
 
     def _load_manifests(
         self, events: Sequence[Event], places: Sequence[int]
     ) -> Iterator[tuple[int, ShardManifest | Exception]]:
         for some in chunks(places, _MANIFESTS_AT_ONCE):
-            yield from zip(some, self._readers.map(self._load, [events[place] for place in some]), strict=True)
+            yield from zip(some, self._readers.map(self._load_manifest, [events[place] for place in some]), strict=True)
 
-    def _load(self, event: Event) -> ShardManifest | Exception:
+    def _load_manifest(self, event: Event) -> ShardManifest | Exception:
         """Return the manifest of a finished task, or the error, so that a thread pool can read many."""
         try:
             assert event.stage is not None
@@ -111,7 +111,7 @@ class Indexer:
         except Exception as error:
             return error
 
-    def _index(self, made: list[ShardManifest]) -> None:
+    def _index_manifests(self, made: list[ShardManifest]) -> None:
         """Index shards in one transaction; if it is rejected, index each shard by itself."""
         try:
             states = self._services.index.write.add_manifests(made) if made else {}
@@ -120,7 +120,7 @@ class Indexer:
                 log.exception("shard %s is not indexed", made[0].shard_id)
             else:
                 for manifest in made:
-                    self._index([manifest])
+                    self._index_manifests([manifest])
             return
         self.publish_states(states)
         self._tally.count_shards(made)
@@ -146,11 +146,11 @@ class Indexer:
         self.publish_states(self._services.index.write.add_manifests([manifest]))
         self._tally.count_shards([manifest])
 
-    def checked(self, kind: AssetKind, digest: str) -> None:
+    def index_asset(self, kind: AssetKind, digest: str) -> None:
         asset = load_asset(self._services.store, kind, digest)
         self._services.index.write.add_asset(asset, load_check(self._services.store, kind, digest))
 
-    def failed(self, attempt: AttemptRecord, *, at_once: bool = False) -> None:
+    def index_attempt(self, attempt: AttemptRecord, *, at_once: bool = False) -> None:
         """Index a failed attempt; the next one follows after a back-off, or at once."""
         wait = 0.0 if at_once else backoff(self._services.settings.retry_backoff_s, attempt.number)
         state = self._services.index.write.add_attempt(attempt, not_before=time.time() + wait)
@@ -168,7 +168,7 @@ class Indexer:
     def flush(self) -> None:
         self._tally.flush()
 
-    def _apply(self, event: Event) -> bool:
+    def _apply_event(self, event: Event) -> bool:
         """Apply one event by itself; return False if it must wait for the store."""
         try:
             with _skip_invalid(f"event {event.kind} of task {event.task_id}"):
@@ -181,12 +181,14 @@ class Indexer:
     def _handle_event(self, event: Event) -> None:
         if event.kind is EventKind.FINISHED:
             kind, _, digest = event.output.partition("/")
-            self.checked(AssetKind(kind), digest)
+            self.index_asset(AssetKind(kind), digest)
         elif event.kind is EventKind.FAILED and event.stage is Stage.INGEST:
             # A check that ended without a result is repeated.
             self._defer(event)
         elif event.kind is EventKind.FAILED:
-            self.failed(read_record(AttemptRecord, self._services.store, attempt_key(event.task_id, event.attempt)))
+            self.index_attempt(
+                read_record(AttemptRecord, self._services.store, attempt_key(event.task_id, event.attempt))
+            )
         else:
             self._tally.add("graspd_task_handbacks_total", event.stage or "", event.kind.value)
             if event.kind is EventKind.DEFERRED:

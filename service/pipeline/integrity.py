@@ -23,7 +23,7 @@ from graspd.service.model.clock import age_of, timestamp
 from graspd.service.model.digests import digest_files
 from graspd.service.model.domain import Asset
 from graspd.service.model.errors import DamagedError, GraspdError, InputError, NotFoundError
-from graspd.service.model.planning import PlannedTask, message_of, plan_tasks
+from graspd.service.model.planning import PlannedTask, create_task_message, plan_tasks
 from graspd.service.model.records import (
     AttemptRecord,
     DatasetEvent,
@@ -219,7 +219,7 @@ def _check_manifest(store: Store, key: str, stage: Stage, shard: str, read: Read
     return None
 
 
-class Interrupted(Exception):
+class ScanInterrupted(Exception):
     """The process stops, or `graspd admin store verify` pauses the scan."""
 
 
@@ -241,7 +241,7 @@ class IntegrityScan:
             try:
                 if self._may_read() and self.advance():
                     continue
-            except Interrupted:
+            except ScanInterrupted:
                 pass
             except GraspdError as error:
                 log.warning("%s; the integrity scan continues later", error)
@@ -267,10 +267,10 @@ class IntegrityScan:
                 return False
             note = ScanNote()
         note = note if note.started else replace(note, started=timestamp())
-        keys = self._keys(FOLDERS[note.folder], note.after)
+        keys = self._next_keys(FOLDERS[note.folder], note.after)
         for key in keys:
             if is_checked(key):
-                self._check(key)
+                self._check_key(key)
             self._recheck_if_due(replace(note, after=key))
         over = len(keys) < _KEYS
         note = replace(note, folder=note.folder + over, after="" if over else keys[-1])
@@ -295,25 +295,25 @@ class IntegrityScan:
     def _is_repaired(self, one: Damage) -> bool:
         stem, dot, _ = one.key.rpartition(".")
         keys = [f"{stem}.json", f"{stem}.h5"] if one.shard and dot else [one.key]
-        return all(examine(self._services.store, key, read=self._pace) is None for key in keys)
+        return all(examine(self._services.store, key, read=self._limit_rate) is None for key in keys)
 
-    def _check(self, key: str) -> None:
-        self._pace(_LEAST)
-        wrong = examine(self._services.store, key, read=self._pace)
+    def _check_key(self, key: str) -> None:
+        self._limit_rate(_LEAST)
+        wrong = examine(self._services.store, key, read=self._limit_rate)
         if wrong is not None and not may_await_manifest(self._services.store, wrong):
             log.warning("%s: %s", wrong.key, wrong.what)
             self._services.index.damage.update([wrong])
 
-    def _keys(self, folder: str, after: str) -> list[str]:
+    def _next_keys(self, folder: str, after: str) -> list[str]:
         listed = self._services.store.list(folder, offset=after or None)
         return heapq.nsmallest(_KEYS, (entry.key for entry in listed))
 
-    def _pace(self, size: int) -> None:
+    def _limit_rate(self, size: int) -> None:
         """Wait until `size` more bytes are within the rate; Interrupted if the scan must end."""
         now = self._clock()
         self._paid = max(self._paid, now - _BURST_S) + size / self._rate
         if self._stop.wait(max(0.0, self._paid - now)) or not self._may_read():
-            raise Interrupted
+            raise ScanInterrupted
 
 
 def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
@@ -321,14 +321,14 @@ def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], l
     harmed = {one.shard for one in found if one.shard}
     repaired, left = [], []
     for one in found:
-        if why := _fix(services, one, harmed):
+        if why := _repair_object(services, one, harmed):
             left.append(Damage(one.key, f"{one.what}; {why}", one.shard))
         else:
             repaired.append(one)
     return repaired, left
 
 
-def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
+def _repair_object(services: Services, one: Damage, harmed: set[str]) -> str:
     """Repair a stored object; return why this is impossible, or ""."""
     if one.what == FOREIGN:
         services.store.set_aside(one.key)
@@ -352,7 +352,7 @@ def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
     if one.what != MISSING:
         _set_aside_result(services, one, stage)
     number = len(task_attempts(services.store, task.id)) + 1
-    message = message_of(job, task, attempt=number, max_attempt=number)
+    message = create_task_message(job, task, attempt=number, max_attempt=number)
     services.queue.enqueue([message], Priority.BULK, again=True)
     return ""
 

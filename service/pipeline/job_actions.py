@@ -23,16 +23,23 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import job_id
 from graspd.service.model.domain import JobOptions, JobRequest, count_batches
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, SceneError, UnavailableError
-from graspd.service.model.messages import Capabilities, Origin, Requirements, WorkerBeat, capabilities, requirements_of
-from graspd.service.model.planning import message_of, priority_of
+from graspd.service.model.messages import (
+    Capabilities,
+    Origin,
+    Requirements,
+    WorkerHeartbeat,
+    capabilities,
+    requirements_of,
+)
+from graspd.service.model.planning import create_task_message, priority_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
-from graspd.service.model.records import MOST_BATCHES, JobRecord, Member
+from graspd.service.model.records import MOST_BATCHES, DatasetMember, JobRecord
 from graspd.service.model.scene_spec import HalfSpace, Pose, Supports
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.transforms import quat_conjugate, quat_rotate
 from graspd.service.model.version import SCHEMA_OF_RANGES
 from graspd.service.pipeline.backends import Services, record_transaction
-from graspd.service.pipeline.fidelity_choice import Resolver
+from graspd.service.pipeline.fidelity_choice import FidelityResolver
 from graspd.service.queue.port import Event, EventKind, Message
 from graspd.service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending_deletion
 from graspd.service.telemetry import bound_subject
@@ -58,7 +65,7 @@ class TaskRanges:
         """`scope` limits the finished tasks whose costs are used."""
         self._services, self._scope, self._clock = services, scope, clock
         self._read_again = -math.inf
-        self._workers: list[WorkerBeat] = []
+        self._workers: list[WorkerHeartbeat] = []
         self._costs: list[BatchCost] = []
 
     def with_span(self, job: JobRecord, *, among: int = 1) -> JobRecord:
@@ -69,7 +76,7 @@ class TaskRanges:
             return job
         if self._clock() >= self._read_again:
             self._workers = self._services.queue.workers()
-            self._costs = self._services.index.costs.of_batches(Stage.SYNTHESIZE, limit=_LOOKED_AT, scope=self._scope)
+            self._costs = self._services.index.costs.batch_costs(Stage.SYNTHESIZE, limit=_LOOKED_AT, scope=self._scope)
             self._read_again = self._clock() + _KNOWN_S
         able = [worker for worker in self._workers if Stage.SYNTHESIZE in worker.stages]
         if any(worker.capabilities.schemas[1] < SCHEMA_OF_RANGES for worker in able):
@@ -77,7 +84,9 @@ class TaskRanges:
         # On CPUs, an interactive job shows its grasps batch by batch; a GPU makes them in one launch.
         if job.priority is Priority.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
             return job
-        rate = Rates(self._costs, job.request, {one.device for one in able}).of(job.request.hand, job.request.object)
+        rate = Rates(self._costs, job.request, {one.device for one in able}).rate_for(
+            job.request.hand, job.request.object
+        )
         batch_s = rate.seconds_per_try * expected_candidates(rate, job.request) / batches
         by_time = int(wanted_s / max(1e-3, batch_s or wanted_s))
         workers = -(-(len(able) or _EXPECTED) // among)
@@ -109,24 +118,26 @@ def refuse_deleted(services: Services, wanted: Sequence[tuple[AssetKind, str]], 
         raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
 
 
-def with_neighbours(
+def resolve_neighbours(
     services: Services, options: Options, scope: ProjectScope = EVERYTHING
 ) -> tuple[Options, Sequence[AssetView]]:
     """Return options with a digest for each neighbour, and the neighbours; given digests stay.
 
     Errors as in `usable_asset`; InputError: name and digest of a neighbour belong to two objects.
     """
-    beside = [usable_asset(services, AssetKind.OBJECT, one.digest or one.object, scope) for one in options.beside]
+    beside = [
+        usable_asset(services, AssetKind.OBJECT, one.digest or one.object, scope) for one in options.all_neighbours
+    ]
     found = []
-    for one, asset in zip(options.beside, beside, strict=True):
+    for one, asset in zip(options.all_neighbours, beside, strict=True):
         if one.object not in (asset.name, asset.digest):
             raise InputError(f"the neighbour {one.object!r} has the digest of {asset.name!r}; omit the digest")
         found.append(one.model_copy(update={"object": asset.name, "digest": asset.digest}))
-    return options.with_beside(found), beside
+    return options.replace_neighbours(found), beside
 
 
-def with_network(
-    services: Services, options: Options, hands: Sequence[AssetView | Member], scope: ProjectScope = EVERYTHING
+def resolve_network(
+    services: Services, options: Options, hands: Sequence[AssetView | DatasetMember], scope: ProjectScope = EVERYTHING
 ) -> Options:
     """Return options with the digest of their network, if they have one.
 
@@ -146,10 +157,10 @@ def with_network(
 
 def submit(services: Services, request: JobRequest, *, priority: Priority | None = None) -> tuple[JobView, bool]:
     """Prepare and enter a job; return it, and whether it is new: equal requests give one job."""
-    return enter_job(services, prepare(services, request, priority=priority))
+    return enter_job(services, prepare_job(services, request, priority=priority))
 
 
-def prepare(
+def prepare_job(
     services: Services,
     request: JobRequest,
     *,
@@ -159,16 +170,17 @@ def prepare(
 ) -> JobRecord:
     """Return the job of a request; `priority` None: interactive for a small job, else bulk.
 
-    Errors of `usable_asset`, `with_neighbours`, `with_network`, `check_scene`; InputError: no fidelity is good enough.
+    Errors of `usable_asset`, `resolve_neighbours`, `resolve_network` and `check_scene`.
+    InputError: no fidelity is good enough.
     """
     hand = usable_asset(services, AssetKind.HAND, request.hand, scope)
     obj = usable_asset(services, AssetKind.OBJECT, request.object, scope)
-    request, beside = with_neighbours(services, request, scope)
-    request = with_network(services, request, [hand], scope)
+    request, beside = resolve_neighbours(services, request, scope)
+    request = resolve_network(services, request, [hand], scope)
     check_scene(request, obj, beside)
     services.queue.ping()
     named = request.model_copy(update={"hand": hand.name, "object": obj.name})
-    request, choice = Resolver(services.store).choose(named)
+    request, choice = FidelityResolver(services.store).choose(named)
     origin = Origin(request=bound_subject("request"), key=bound_subject("key"))
     record = JobRecord(
         id=job_id(request, hand.digest, obj.digest, scope.project),
@@ -204,7 +216,7 @@ def enter_job(services: Services, record: JobRecord, *, keeps_assets: bool = Fal
         if not keeps_assets:
             refuse_deleted(services, record.assets, connection)
         services.index.write.enter_job(record, within=connection)
-    _start(services, record.id)
+    _queue_first_tasks(services, record.id)
     return services.index.jobs.get(record.id), new
 
 
@@ -213,7 +225,7 @@ def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
 
     `cause` is the dataset event that caused this, if any. ConflictError: the job has ended.
     """
-    with _transaction(services, job_id, _refuse_ended) as add:
+    with _event_transaction(services, job_id, _refuse_ended) as add:
         in_queue = services.index.feed.unfinished_tasks(job_id)
         add("cancelled", cause=cause)
     try:
@@ -225,9 +237,9 @@ def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
 
 def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
     """Restart unsuccessful tasks of a failed or cancelled job, with new attempts; else ConflictError."""
-    with _transaction(services, job_id, _require_failures) as add:
+    with _event_transaction(services, job_id, _require_failures) as add:
         add("retried", services.index.feed.failed_tasks(job_id), cause=cause)
-    _start(services, job_id)
+    _queue_first_tasks(services, job_id)
     return _publish_state(services, job_id)
 
 
@@ -240,7 +252,7 @@ class Route:
 
 
 class Routes:
-    def __init__(self, present: Sequence[WorkerBeat] = ()) -> None:
+    def __init__(self, present: Sequence[WorkerHeartbeat] = ()) -> None:
         self._here: dict[Stage, list[Capabilities]] = defaultdict(list)
         for beat in present:
             for stage in beat.stages:
@@ -253,7 +265,7 @@ class Routes:
         If none is, the task is held back. Without workers, the capabilities of this version are assumed.
         """
         here = self._here.get(need.stage) or [capabilities()]
-        lacking = {one.lacks(need) for one in here}
+        lacking = {one.unmet_requirement(need) for one in here}
         if "" not in lacking:
             return Route(held=f"held back, because no present worker is capable: {'; '.join(sorted(lacking))}")
         return Route(apart=lacking != {""})
@@ -268,7 +280,7 @@ def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Route
     held: dict[str, list[str]] = defaultdict(list)
     for task in ready:
         most = task.retried_upto + services.settings.task_attempts
-        message = message_of(task.job, task.task, attempt=task.last_attempt + 1, max_attempt=most)
+        message = create_task_message(task.job, task.task, attempt=task.last_attempt + 1, max_attempt=most)
         place = routes.route_of(requirements_of(message))
         if place.held:
             held[place.held].append(task.task.id)
@@ -283,7 +295,7 @@ def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Route
     return set(held)
 
 
-def _start(services: Services, job_id: str) -> None:
+def _queue_first_tasks(services: Services, job_id: str) -> None:
     """Queue tasks of a job until the queue's window is full; the controller queues the other ones."""
     try:
         room = services.settings.queue_window - sum(services.queue.depths().values())
@@ -296,7 +308,9 @@ def _start(services: Services, job_id: str) -> None:
 
 
 @contextmanager
-def _transaction(services: Services, job_id: str, refuse: Callable[[JobView], None]) -> Iterator[Callable[..., None]]:
+def _event_transaction(
+    services: Services, job_id: str, refuse: Callable[[JobView], None]
+) -> Iterator[Callable[..., None]]:
     """Yield a function that appends an event to a job within an index transaction, unless `refuse` raises."""
     # Earlier events are read before the transaction, because the store may be slow.
     refuse(services.index.jobs.get(job_id))
@@ -335,7 +349,7 @@ def _publish_state(services: Services, job_id: str) -> JobView:
 
 def check_scene(options: JobOptions, obj: AssetView, beside: Sequence[AssetView] = ()) -> None:
     """Raise SceneError if a centre of mass lies in a support; the first task makes further checks."""
-    place = options.place
+    place = options.scene_spec
     _check_pose(obj, "target", place.target, place.supports)
     for asset, one in zip(beside, place.neighbours, strict=True):
         _check_pose(asset, "neighbour", one.pose, place.supports)

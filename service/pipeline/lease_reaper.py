@@ -19,7 +19,7 @@ from graspd.service.pipeline.indexer import Indexer
 from graspd.service.queue.port import Lease
 from graspd.service.store.integrity import put_document
 from graspd.service.store.manifests import load_manifest
-from graspd.service.store.packs import unpack_all
+from graspd.service.store.packs import convert_packs
 from graspd.service.store.records import put_record, read_record, task_attempts
 
 log = logging.getLogger(__name__)
@@ -64,64 +64,64 @@ class LeaseReaper:
         now = self._clock()
         self._missing = {task: self._missing.get(task, now) for task in believed - set(present)}
         missing = [task for task, since in self._missing.items() if now - since >= LOST_AFTER_S]
-        self._recover([task for task in missing if task in tasks])
+        self._recover_tasks([task for task in missing if task in tasks])
         for kind, digest in checks:
             if ingest_id(kind, digest) in missing:
                 self._recover_check(kind, digest)
         return missing
 
-    def _recover(self, missing: list[str]) -> None:
+    def _recover_tasks(self, missing: list[str]) -> None:
         """Index results of missing tasks that the store has; mark the other ones as not queued."""
         again = []
         if missing:  # During an upgrade, workers of graspd 0.2 may have written packs.
-            for manifest in unpack_all(self._services.store):
+            for manifest in convert_packs(self._services.store):
                 self._indexer.index_shard(manifest)
         for task, (stage, shard) in self._services.index.feed.outputs(missing).items():
-            if self._find(task, Stage(stage), shard):
+            if self._index_existing_shard(task, Stage(stage), shard):
                 continue
             known = self._services.index.jobs.task(task).attempt
             try:
                 recorded = [a for a in task_attempts(self._services.store, task) if a.number >= known]
             except DamagedError as error:
-                self._fail(task, Stage(stage), error)
+                self._fail_task(task, Stage(stage), error)
                 continue
             for attempt in recorded:
-                self._indexer.failed(attempt)
+                self._indexer.index_attempt(attempt)
             if not recorded:
                 again.append(task)
         if again:
             log.warning("%d tasks were lost from the queue and are queued again", len(again))
             self._indexer.publish_states(self._services.index.live.set_waiting(again))
 
-    def _find(self, task_id: str, stage: Stage, shard: str) -> bool:
+    def _index_existing_shard(self, task_id: str, stage: Stage, shard: str) -> bool:
         """Index a shard if it exists; return whether it does. A damaged manifest fails its task for good."""
         try:
             self._indexer.index_shard(load_manifest(self._services.store, stage, shard))
         except NotFoundError:
             return False
         except DamagedError as error:
-            self._fail(task_id, stage, error)
+            self._fail_task(task_id, stage, error)
         return True
 
-    def _fail(self, task_id: str, stage: Stage, error: DamagedError) -> None:
+    def _fail_task(self, task_id: str, stage: Stage, error: DamagedError) -> None:
         task = self._services.index.jobs.task(task_id)
         about = {"task_id": task_id, "job_id": task.job_id, "stage": stage, "number": task.attempt}
         why = {"kind": type(error).__name__, "reason": str(error), "worker": "controller"}
         attempt = AttemptRecord.model_validate({**about, **why, "ended": timestamp(), "last": True})
         put_record(self._services.store, names.attempt_key(task_id, attempt.number), attempt)
-        self._indexer.failed(attempt)
+        self._indexer.index_attempt(attempt)
 
     def _recover_check(self, kind: AssetKind, digest: str) -> None:
         if self._services.store.exists(names.asset_check_key(kind, digest)):
             try:
-                self._indexer.checked(kind, digest)
+                self._indexer.index_asset(kind, digest)
             except DamagedError as error:
                 log.warning("%s", error)
         else:
             self._services.index.live.set_asset_waiting([digest], queued=False)
 
     def _handle_lost_lease(self, lease: Lease) -> None:
-        worker, message = self._services.queue.holder(lease)
+        worker, message = self._services.queue.lease_holder(lease)
         log.warning("worker %s was lost with task %s (attempt %d)", worker, lease.task_id, lease.attempt)
         try:
             if isinstance(message, TaskMessage):
@@ -136,9 +136,9 @@ class LeaseReaper:
         self._services.queue.release(lease)
 
     def _fail_lost_task(self, worker: str, message: TaskMessage) -> None:
-        if self._find(message.task_id, message.stage, message.output):
+        if self._index_existing_shard(message.task_id, message.stage, message.output):
             return
-        attempt = AttemptRecord.of(
+        attempt = AttemptRecord.from_message(
             message,
             kind="WorkerLost",
             reason=f"worker {worker} was lost: no heartbeat for {self._services.settings.lease_s:g} s",
@@ -150,10 +150,10 @@ class LeaseReaper:
             try:
                 attempt = read_record(AttemptRecord, self._services.store, key)
             except DamagedError as error:
-                self._fail(message.task_id, message.stage, error)
+                self._fail_task(message.task_id, message.stage, error)
                 return
         # No back-off after the first attempt: its loss is more often caused by the machine than by the task.
-        self._indexer.failed(attempt, at_once=attempt.number == 1)
+        self._indexer.index_attempt(attempt, at_once=attempt.number == 1)
 
     def _fail_lost_check(self, message: IngestMessage) -> None:
         if message.attempt >= message.max_attempt:
@@ -161,6 +161,6 @@ class LeaseReaper:
             reason = f"{ended}; delete it to try again"
             found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}
             put_document(self._services.store, names.asset_check_key(message.kind, message.digest), found)
-            self._indexer.checked(message.kind, message.digest)
+            self._indexer.index_asset(message.kind, message.digest)
         else:
             self._services.index.live.add_asset_attempt(message.digest, message.attempt, not_before=0.0)

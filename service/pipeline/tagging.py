@@ -11,10 +11,10 @@ from graspd.service.model.records import MOST_TAGGED, Grasp, Tag, rows_by_shard,
 from graspd.service.pipeline.backends import Services, record_transaction
 from graspd.service.store.records import (
     Deletion,
-    drop_older_versions,
-    newest_version,
+    delete_older_tag_versions,
+    newest_tag_version,
     put_record,
-    put_version,
+    put_tag_version,
     removed_folder,
 )
 
@@ -27,7 +27,7 @@ def tag_grasps(
 ) -> int:
     """Add a tag to grasps; return how many did not have it. LimitError: more than `MOST_TAGGED` in all."""
 
-    def added(tag: Tag) -> Tag:
+    def add_grasps(tag: Tag) -> Tag:
         members = tag.members | set(grasps)
         if len(members) > MOST_TAGGED:
             raise LimitError(f"the tag {name!r} would name {len(members)} grasps; a tag names at most {MOST_TAGGED}")
@@ -35,24 +35,24 @@ def tag_grasps(
 
     now = timestamp()
     fresh = Tag(id=tag_id(name, project), name=name, number=1, created=now, changed=now, owner=owner, project=project)
-    before, after = _change(services, fresh.id, added, permit, fresh=fresh)
+    before, after = _change_tag(services, fresh.id, add_grasps, permit, fresh=fresh)
     return len(after.members) - len(before.members)
 
 
 def untag_grasps(services: Services, tag: str, grasps: Collection[Grasp], *, permit: Permit) -> int:
     """Remove a tag, by its id, from grasps; return how many had it."""
 
-    def without(one: Tag) -> Tag:
+    def remove_grasps(one: Tag) -> Tag:
         return one.model_copy(update={"grasps": rows_by_shard(one.members - set(grasps))})
 
-    before, after = _change(services, tag, without, permit)
+    before, after = _change_tag(services, tag, remove_grasps, permit)
     return len(before.members) - len(after.members)
 
 
 def delete_tag(services: Services, tag: str, *, permit: Permit, owner: str = "") -> None:
     """Delete a tag by its id; its list of grasps is stored for the grace time."""
 
-    def gone(one: Tag) -> Tag:
+    def mark_deleted(one: Tag) -> Tag:
         said = {"name": one.name, "submitter": one.owner, "project": one.project}
         deletion = Deletion(what="tag", id=one.id, at=timestamp(), owner=owner, **said)
         folder = removed_folder(deletion)
@@ -60,7 +60,7 @@ def delete_tag(services: Services, tag: str, *, permit: Permit, owner: str = "")
         put_record(services.store, f"{folder}/deletion.json", deletion)
         return one.model_copy(update={"grasps": {}, "gone": True})
 
-    _change(services, tag, gone, permit)
+    _change_tag(services, tag, mark_deleted, permit)
 
 
 def restore_tag(services: Services, tag: Tag) -> None:
@@ -70,15 +70,15 @@ def restore_tag(services: Services, tag: Tag) -> None:
         if known is not None:
             raise ConflictError(f"there is a tag {tag.name!r} again; delete that first")
 
-    _change(services, tag.id, lambda one: one, permit, fresh=tag)
+    _change_tag(services, tag.id, lambda one: one, permit, fresh=tag)
 
 
-def _change(
+def _change_tag(
     services: Services, tag: str, change: Callable[[Tag], Tag], permit: Permit, *, fresh: Tag | None = None
 ) -> tuple[Tag, Tag]:
     """Change a tag, or the new tag `fresh`; return it before and after; NotFoundError without either."""
     with record_transaction(services) as (connection, put):
-        found = newest_version(services.store, tag)
+        found = newest_tag_version(services.store, tag)
         known = None if found is None or found.gone else found
         if known is None and fresh is None:
             raise NotFoundError(f"there is no tag {tag!r}")
@@ -88,10 +88,10 @@ def _change(
         after = change(before).model_copy(update={"number": found.number + 1 if found else 1, "changed": timestamp()})
         is_changed = known is None or after.members != before.members or after.gone
         if is_changed:
-            put_version(put, after)
+            put_tag_version(put, after)
             services.index.tags.put(after, within=connection)
     if is_changed:
         # Older versions are deleted after the commit, while no other process can read the last version.
         with services.index.database.write_transaction():
-            drop_older_versions(services.store, after)
+            delete_older_tag_versions(services.store, after)
     return before, after

@@ -26,7 +26,7 @@ from graspd.service.index.outbox import DueDelivery
 from graspd.service.index.views import EndView
 from graspd.service.model.errors import InputError, UnavailableError
 from graspd.service.model.planning import interleave
-from graspd.service.model.webhooks import SIGNATURE, secret_of, signature
+from graspd.service.model.webhooks import SIGNATURE, derive_secret, signature
 from graspd.service.pipeline.backends import Services
 
 log = logging.getLogger(__name__)
@@ -138,7 +138,7 @@ def post(
     except (OSError, ValueError):
         return Response(None, "the host of the address cannot be looked up")
     # The time-out of a socket restarts with each byte; this timer limits the whole exchange.
-    end = threading.Timer(patience_s, connection.cut)
+    end = threading.Timer(patience_s, connection.shut_down)
     end.daemon = True
     end.start()
     try:
@@ -168,7 +168,7 @@ class _Connection(http.client.HTTPConnection):
         dialled = self._dial()
         self.sock = self._context.wrap_socket(dialled, server_hostname=self.host) if self._context else dialled
 
-    def cut(self) -> None:
+    def shut_down(self) -> None:
         """Shut the connection down, from another thread."""
         with contextlib.suppress(OSError):
             if self.sock is not None:
@@ -228,7 +228,7 @@ class WebhookDispatcher:
         """Create deliveries of newly ended jobs and datasets; start due ones while slots are free."""
         out = self._services.index.outbox
         if time.monotonic() > self._forget_again:
-            out.forget_old()
+            out.delete_expired()
             self._forget_again = time.monotonic() + _FORGET_EVERY_S
         if not self._master:
             return []
@@ -278,13 +278,13 @@ class WebhookDispatcher:
                 self._ended.set()
 
     def _deliver(self, due: DueDelivery) -> None:
-        body = body_of(due.end)
+        body = webhook_body(due.end)
         at = int(time.time())
         headers = {
             "Content-Type": "application/json",
             "User-Agent": "graspd-webhook",
             "X-Graspd-Delivery": f"{due.hook.id}-{due.end.seq}",
-            SIGNATURE: signature(secret_of(self._master, due.hook.id), at, body),
+            SIGNATURE: signature(derive_secret(self._master, due.hook.id), at, body),
         }
         answer = self._send(due.hook.url, body, headers, allowed=self._allowed)
         done = answer.is_accepted
@@ -293,5 +293,5 @@ class WebhookDispatcher:
         outbox.record_attempt(due, status=answer.status, detail=answer.detail, done=done, final=answer.is_final)
 
 
-def body_of(end: EndView) -> bytes:
+def webhook_body(end: EndView) -> bytes:
     return json.dumps(end.model_dump(mode="json"), sort_keys=True, separators=(",", ":")).encode()

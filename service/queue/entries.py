@@ -29,13 +29,13 @@ from rq.serializers import JSONSerializer
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from graspd.service.model.errors import TaskRefused
-from graspd.service.model.messages import FIRST_SCHEMA, Capabilities, Requirements, WorkerBeat, message_type
+from graspd.service.model.messages import FIRST_SCHEMA, Capabilities, Requirements, WorkerHeartbeat, message_type
 from graspd.service.model.renamed import convert_names
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import Event, Message, priority_order
 
-Entry = TypeVar("Entry", WorkerBeat, Event)
-_ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for kind in (WorkerBeat, Event)}
+Entry = TypeVar("Entry", WorkerHeartbeat, Event)
+_ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for kind in (WorkerHeartbeat, Event)}
 _ATTEMPT: Final = re.compile(r"(.+)-([0-9]{1,9})")
 #: Limit of an unpacked message [bytes]; real messages have a few kilobytes.
 _MESSAGE_BYTES: Final = 1 << 20
@@ -48,7 +48,7 @@ def decode_text(raw: bytes | None) -> str:
     return (raw or b"").decode(errors="replace")
 
 
-def task_of(job: str) -> tuple[str, int]:
+def split_rq_id(job: str) -> tuple[str, int]:
     """Split an RQ job id into task id and attempt; a forged id counts as a task id with attempt 0."""
     match = _ATTEMPT.fullmatch(job)
     return (match[1], int(match[2])) if match else (job, 0)
@@ -112,7 +112,7 @@ def new_job(message: dict[str, Any], **options: Any) -> Job:
     return Job.create(TASK_FUNCTION, args=(message,), **lifetimes, serializer=JSONSerializer, **options)
 
 
-def checked_job(job: Job, queue: Queue) -> Job:
+def sanitized_job(job: Job, queue: Queue) -> Job:
     """Return a safe copy of a job from Redis; TaskRefused if the job is not a task of graspd."""
     try:
         name, message = str(job.func_name), job.args[0]
@@ -155,7 +155,7 @@ def queue_names(stages: Collection[Stage], taken: int = 0, *, ability: Capabilit
         for priority in priority_order(taken)
         for stage in _STAGE_ORDER
         if stage in stages
-        for need in (*_needs(stage, ability), None)
+        for need in (*_served_requirements(stage, ability), None)
     ]
 
 
@@ -172,11 +172,11 @@ def list_names(connection: Any) -> list[str]:
 
 
 def priority_and_stage_of(name: str) -> tuple[Priority, Stage]:
-    return _PLACES[_common(name)]
+    return _PLACES[_common_list_name(name)]
 
 
 def is_separate(name: str) -> bool:
-    return name not in _PLACES and _common(name) in _PLACES
+    return name not in _PLACES and _common_list_name(name) in _PLACES
 
 
 def unserved_lists(names: Iterable[str], abilities: Collection[tuple[Stage, Capabilities]]) -> list[str]:
@@ -185,12 +185,12 @@ def unserved_lists(names: Iterable[str], abilities: Collection[tuple[Stage, Capa
     return [name for name in names if is_separate(name) and name not in served]
 
 
-def _common(name: str) -> str:
+def _common_list_name(name: str) -> str:
     found = _APART.fullmatch(name)
     return found[1] if found else name
 
 
-def _needs(stage: Stage, ability: Capabilities | None) -> list[Requirements]:
+def _served_requirements(stage: Stage, ability: Capabilities | None) -> list[Requirements]:
     """Return the requirements of separate lists that a worker can serve."""
     if ability is None:
         return []
@@ -202,7 +202,7 @@ def list_key(name: str) -> str:
     return f"{Queue.redis_queue_namespace_prefix}{name}"
 
 
-def held_key(name: str) -> str:
+def lease_registry_key(name: str) -> str:
     return str(StartedJobRegistry.key_template.format(name))
 
 
@@ -225,5 +225,5 @@ def execution_keys(entry: str) -> tuple[str, str]:
 
 
 def key_types(lists: list[str]) -> dict[str, str]:
-    types = ((list_key, "list"), (held_key, "zset"), (workers_key, "set"))
+    types = ((list_key, "list"), (lease_registry_key, "zset"), (workers_key, "set"))
     return {key(name): kind for name in lists for key, kind in types}

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final
 from pydantic import BeforeValidator, ConfigDict, Field
 
 from graspd.service.model.base import Model, Word
-from graspd.service.model.messages import Amount, Count, HostWord, IngestMessage, TaskMessage, WorkerBeat
+from graspd.service.model.messages import Amount, Count, HostWord, IngestMessage, TaskMessage, WorkerHeartbeat
 from graspd.service.model.states import Priority, Stage
 
 Message = TaskMessage | IngestMessage
@@ -82,4 +82,4 @@ class QueueStatus:
     depth: Mapping[Place, int] = field(default_factory=dict)
     oldest_s: Mapping[Place, float] = field(default_factory=dict)
     running: Mapping[Place, int] = field(default_factory=dict)
-    workers: Mapping[str, tuple[WorkerBeat, float]] = field(default_factory=dict)
+    workers: Mapping[str, tuple[WorkerHeartbeat, float]] = field(default_factory=dict)

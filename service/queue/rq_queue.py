@@ -25,7 +25,7 @@ from rq.serializers import JSONSerializer
 from graspd.service.model.base import first_line
 from graspd.service.model.clock import age_of
 from graspd.service.model.errors import QueueUnavailable
-from graspd.service.model.messages import WorkerBeat, requirements_of
+from graspd.service.model.messages import WorkerHeartbeat, requirements_of
 from graspd.service.model.renamed import message_for_revision
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue import entries
@@ -100,16 +100,16 @@ class RqQueue:
             pipe.execute()
             for key in self._list_keys():
                 for job in self.connection.lrange(key, 0, -1):
-                    if entries.task_of(entries.decode_text(job))[0] in wanted:
+                    if entries.split_rq_id(entries.decode_text(job))[0] in wanted:
                         pipe.lrem(key, 0, job)
                         pipe.delete(entries.job_key(entries.decode_text(job)))
             pipe.execute()
 
-    def waiting(self) -> set[str]:
+    def waiting_tasks(self) -> set[str]:
         with _convert_errors(), self.connection.pipeline(transaction=True) as pipe:
             for key in self._list_keys():
                 pipe.lrange(key, 0, -1)
-            return {entries.task_of(entries.decode_text(job))[0] for jobs in pipe.execute() for job in jobs}
+            return {entries.split_rq_id(entries.decode_text(job))[0] for jobs in pipe.execute() for job in jobs}
 
     def depths(self) -> dict[tuple[Priority, Stage], int]:
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
@@ -121,7 +121,7 @@ class RqQueue:
                 depths[entries.priority_and_stage_of(name)] += length
             return dict(depths)
 
-    def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
+    def remove_unserved_lists(self, present: Collection[WorkerHeartbeat]) -> None:
         """Remove separate lists that no worker can serve; the controller queues their tasks again."""
         abilities = [(stage, beat.capabilities) for beat in present for stage in beat.stages]
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
@@ -131,7 +131,7 @@ class RqQueue:
                     pipe.delete(entries.job_key(entries.decode_text(job)))
                 pipe.delete(key)
                 # Leases of running tasks are read under the list's name.
-                if not self.connection.exists(entries.held_key(name)):
+                if not self.connection.exists(entries.lease_registry_key(name)):
                     pipe.srem(entries.LISTS, key)
             pipe.execute()
 
@@ -139,18 +139,20 @@ class RqQueue:
         """Return the leases of all workers, living or dead; reading changes nothing."""
         # RQ's own readers also move lost tasks and run callbacks, so the keys are read directly.
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
-            keys = [entries.held_key(name) for name in entries.list_names(self.connection)]
+            keys = [entries.lease_registry_key(name) for name in entries.list_names(self.connection)]
             for key in keys:
                 pipe.zrange(key, 0, -1, withscores=True)
             found = pipe.execute()
         # Every heartbeat changes the score, and an entry belongs to one execution only.
         return [
-            Lease(*entries.task_of(entries.decode_text(entry.partition(b":")[0])), key=(key, entry), beat=str(score))
+            Lease(
+                *entries.split_rq_id(entries.decode_text(entry.partition(b":")[0])), key=(key, entry), beat=str(score)
+            )
             for key, held in zip(keys, found, strict=True)
             for entry, score in held
         ]
 
-    def holder(self, lease: Lease) -> tuple[str, Message | None]:
+    def lease_holder(self, lease: Lease) -> tuple[str, Message | None]:
         """Return worker and message of a lost lease; "" or None if Redis has lost the data."""
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             pipe.hmget(entries.job_key(entries.decode_text(lease.key[1].partition(b":")[0])), "worker_name", "data")
@@ -167,12 +169,12 @@ class RqQueue:
             pipe.delete(*entries.execution_keys(name), entries.job_key(name.partition(":")[0]))
             pipe.execute()
 
-    def workers(self) -> list[WorkerBeat]:
+    def workers(self) -> list[WorkerHeartbeat]:
         """Return the workers with a heartbeat within the last lease time."""
         with _convert_errors():
             names = sorted(self.connection.smembers(WORKERS))
             found = self.connection.mget([_WORKER + name for name in names]) if names else []
-        return [beat for data in found if (beat := entries.parse_entry(WorkerBeat, data)) is not None]
+        return [beat for data in found if (beat := entries.parse_entry(WorkerHeartbeat, data)) is not None]
 
     def publish(self, *events: Event) -> None:
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
@@ -195,7 +197,7 @@ class RqQueue:
             with _convert_errors():
                 self.connection.xack(EVENTS, _GROUP, *event_ids)
 
-    def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
+    def events_after(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Return the events after an id, for any number of readers; `"$"`: only future events, `"0"`: all."""
         with _convert_errors():
             found = self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
@@ -210,13 +212,13 @@ class RqQueue:
         with _convert_errors():
             return bool(self.connection.exists(_part_key(part)))
 
-    def service(self) -> str | None:
+    def service_id(self) -> str | None:
         """Return the identity of the service that owns this queue; None if unset, or lost by Redis."""
         with _convert_errors():
             found = self.connection.get(_SERVICE)
         return None if found is None else entries.decode_text(found)
 
-    def set_service(self, identity: str, *, instead: bool = False) -> None:
+    def set_service_id(self, identity: str, *, instead: bool = False) -> None:
         """Set the identity of the owning service; an existing one is replaced only with `instead`."""
         with _convert_errors():
             self.connection.set(_SERVICE, identity, nx=not instead)
@@ -255,7 +257,7 @@ class RqQueue:
             for name in lists:
                 pipe.llen(entries.list_key(name))
                 pipe.lindex(entries.list_key(name), 0)
-                pipe.zcard(entries.held_key(name))
+                pipe.zcard(entries.lease_registry_key(name))
             found = pipe.execute()
             for head in found[1::3]:
                 pipe.hget(entries.job_key(entries.decode_text(head)), "enqueued_at")
@@ -276,7 +278,7 @@ class RqQueue:
         }
         return QueueStatus(depth, oldest, running, workers)
 
-    def count(self, amounts: Mapping[str, float]) -> None:
+    def add_to_counters(self, amounts: Mapping[str, float]) -> None:
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             for name, amount in amounts.items():
                 pipe.hincrbyfloat(METRICS, name, amount)
@@ -291,7 +293,7 @@ class RqQueue:
                 sums[entries.decode_text(name)] = float(raw)
         return sums
 
-    def tidy(self) -> None:
+    def remove_stale_keys(self) -> None:
         """Remove keys of wrong types, and the registrations of dead workers, which RQ leaves."""
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             lists = entries.list_names(self.connection)
@@ -364,7 +366,7 @@ def lease_state(connection: Any, job: Job, execution: Execution) -> tuple[bool, 
     """Return whether the worker still has the lease of its task, and whether the task is cancelled."""
     with connection.pipeline(transaction=False) as pipe:
         pipe.zscore(job.started_job_registry.key, execution.composite_key)
-        pipe.exists(cancel_key(entries.task_of(job.id)[0]))
+        pipe.exists(cancel_key(entries.split_rq_id(job.id)[0]))
         score, cancelled = pipe.execute()
     return score is not None, bool(cancelled)
 

@@ -15,7 +15,7 @@ from graspd.service.model import transforms
 from graspd.service.model.errors import InputError
 from graspd.service.model.pinhole import back_project, fitted_normals, surface_normals
 from graspd.service.model.transforms import Floats
-from graspd.service.readers.depth_noise import DepthNoise, incidence, noise_of
+from graspd.service.readers.depth_noise import DepthNoise, incidence_angle, parse_depth_noise
 from graspd.service.readers.pictures import PictureAddress, Pictures, Scenes
 from graspd.service.store.shards import Shard
 
@@ -87,10 +87,10 @@ class Clouds(Sequence[dict[str, Any]]):
         if points < 1 or voxel_m < 0 or touch_m <= 0 or seed < 0:
             raise InputError("clouds need points >= 1, voxel_m >= 0, touch_m > 0 and seed >= 0")
         self.pictures, self.points, self.frame, self.epoch = pictures, points, chosen, 0
-        self._noise, self._whole, self._voxel, self._seed = noise_of(noise), scene, voxel_m, seed
+        self._noise, self._whole, self._voxel, self._seed = parse_depth_noise(noise), scene, voxel_m, seed
         self._postures, self._surface, self._touch = tuple(postures), hand_surface, touch_m
         self._fused = fuse
-        self._places = _by_scene(pictures.places) if fuse else [[place] for place in pictures.places]
+        self._places = _group_by_scene(pictures.places) if fuse else [[place] for place in pictures.places]
 
     def __len__(self) -> int:
         return len(self._places)
@@ -104,7 +104,7 @@ class Clouds(Sequence[dict[str, Any]]):
         views = [CloudView(self.pictures.columns_of(place, COLUMNS), self._noise, draw) for place in places]
         object_pose = scenes.object_pose(first.scene)
         into = self._frame_transform(views[0].extrinsics, object_pose)
-        sample = self._cloud(views, draw, into)
+        sample = self._sample_cloud(views, draw, into)
         if self._surface is not None:
             touched = self._graspness(views, sample["cloud/pixel"], scenes, first.scene)
             sample["cloud/graspness"] = np.where(sample["cloud/object"] == 1, touched, 0.0).astype(np.float32)
@@ -116,11 +116,11 @@ class Clouds(Sequence[dict[str, Any]]):
         sample["object/pose"] = transforms.compose(into, object_pose)
         return sample | self._labels(scenes, first.scene, views[0].extrinsics, into) | first.names
 
-    def _cloud(self, views: Sequence[CloudView], draw: np.random.Generator, into: Floats) -> dict[str, Any]:
+    def _sample_cloud(self, views: Sequence[CloudView], draw: np.random.Generator, into: Floats) -> dict[str, Any]:
         found = [view.pixels(whole=self._whole) for view in views]
         pixel = np.concatenate([np.stack([np.full(len(row), v), row, col], 1) for v, (row, col) in enumerate(found)])
         if self._voxel:
-            pixel = pixel[_voxels(_gather(views, pixel, CloudView.points), self._voxel, draw)]
+            pixel = pixel[_voxel_sample(_gather(views, pixel, CloudView.points), self._voxel, draw)]
         seen = len(pixel)
         if seen >= self.points:
             pixel = pixel[draw.choice(seen, self.points, replace=False)]
@@ -170,7 +170,7 @@ class Clouds(Sequence[dict[str, Any]]):
         return transforms.IDENTITY_POSE
 
 
-def _by_scene(places: Sequence[PictureAddress]) -> list[list[PictureAddress]]:
+def _group_by_scene(places: Sequence[PictureAddress]) -> list[list[PictureAddress]]:
     found: dict[tuple[str, int], list[PictureAddress]] = defaultdict(list)
     for place in places:
         found[place.file.id, place.scene].append(place)
@@ -185,7 +185,7 @@ def _gather(views: Sequence[CloudView], pixel: Ints, what: Callable[[CloudView, 
     return found
 
 
-def _voxels(points: Floats, edge: float, draw: np.random.Generator) -> Ints:
+def _voxel_sample(points: Floats, edge: float, draw: np.random.Generator) -> Ints:
     order = draw.permutation(len(points))
     cubes = np.floor(points[order] / edge).astype(np.int64)
     return order[np.unique(cubes, axis=0, return_index=True)[1]]
@@ -249,7 +249,7 @@ class CloudView:
         #: Measured depth (H, W) [m]; not finite: no measurement.
         self.seen = depth = np.asarray(columns["image/depth"], float)
         if noise is not None:
-            self._angle = incidence(depth, self._k)
+            self._angle = incidence_angle(depth, self._k)
             self.seen = noise.apply(depth, self._k, draw, angle=self._angle)
 
     def pixels(self, *, whole: bool) -> tuple[Ints, Ints]:

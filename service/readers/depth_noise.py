@@ -100,7 +100,7 @@ class DepthNoise:
             angle: (H, W) angle of incidence [rad], if already computed.
         """
         true = np.where(np.isfinite(depth), np.asarray(depth, float), np.nan)
-        angle = incidence(true, k) if angle is None else angle
+        angle = incidence_angle(true, k) if angle is None else angle
         scale = float(k[0, 0]) / self.focal_px
         with np.errstate(invalid="ignore", divide="ignore"):
             seen = _shift_pixels(true, scale * (self.lateral_px + self.lateral_angle_px * _steepness(angle)), draw)
@@ -111,7 +111,7 @@ class DepthNoise:
                 seen = self._quantize_disparity(seen, draw)
             if self.depth_step_m:
                 seen = np.round(seen / self.depth_step_m) * self.depth_step_m
-            return np.where(self._holes(true, angle, k, draw), np.nan, seen)
+            return np.where(self._hole_mask(true, angle, k, draw), np.nan, seen)
 
     def _quantize_disparity(self, depth: Floats, draw: np.random.Generator) -> Floats:
         product = self.focal_px * self.baseline_m
@@ -120,15 +120,15 @@ class DepthNoise:
             disparity = np.round(disparity / self.disparity_step_px) * self.disparity_step_px
         return np.where(disparity > 0, product / disparity, np.nan)
 
-    def _holes(self, true: Floats, angle: Floats, k: Floats, draw: np.random.Generator) -> Bools:
+    def _hole_mask(self, true: Floats, angle: Floats, k: Floats, draw: np.random.Generator) -> Bools:
         holes = np.degrees(angle) > self.steepest_deg
         if self.baseline_m:
             holes |= self.focal_px * self.baseline_m / true > self.most_disparity_px
-            holes |= shadows(true, float(k[0, 0]) * self.baseline_m)
+            holes |= shadow_mask(true, float(k[0, 0]) * self.baseline_m)
         return np.asarray(holes | (draw.random(true.shape) < self.dropout))
 
 
-def incidence(depth: Floats, k: Floats) -> Floats:
+def incidence_angle(depth: Floats, k: Floats) -> Floats:
     """Compute the angle (H, W) between surface normal and ray [rad]; 0 where the normal is undefined."""
     points = back_project(k, depth)
     with np.errstate(invalid="ignore"):
@@ -136,7 +136,7 @@ def incidence(depth: Floats, k: Floats) -> Floats:
     return np.arccos(np.clip(np.nan_to_num(cosine, nan=1.0), 0.0, 1.0))
 
 
-def shadows(depth: Floats, focal_baseline: float) -> Bools:
+def shadow_mask(depth: Floats, focal_baseline: float) -> Bools:
     """Find the pixels (H, W) hidden from the right eye; disparity [px] is `focal_baseline` [px m] / depth.
 
     Each pixel is projected into the other picture, which shows the nearest surface. A pixel is hidden if it is more
@@ -213,7 +213,7 @@ NOISES: Final[Mapping[str, DepthNoise]] = MappingProxyType(
 )
 
 
-def noise_of(given: str | DepthNoise | None) -> DepthNoise | None:
+def parse_depth_noise(given: str | DepthNoise | None) -> DepthNoise | None:
     if given is None or isinstance(given, DepthNoise):
         return given
     if given not in NOISES:

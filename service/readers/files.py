@@ -20,7 +20,7 @@ from graspd.service.store.integrity import check_content, check_digest, check_fi
 from graspd.service.store.manifests import load_manifest
 from graspd.service.store.packs import PACKED, has_packs
 from graspd.service.store.records import newest_snapshot, read_record
-from graspd.service.store.shards import kind_of, open_shard
+from graspd.service.store.shards import open_shard, shard_kind
 from graspd.service.store.store import Store, open_store
 from graspd.service.user_cache import cache_folder, evict, write_atomically
 
@@ -59,7 +59,7 @@ class ShardCache:
         """Return the path of the cached file, downloaded if needed; DamagedShard if missing or damaged."""
         path = self.folder / f"{sha256}.h5"
         if not self._is_intact(path, sha256):
-            write_atomically(path, self._checked(store, key, sha256))
+            write_atomically(path, self._download(store, key, sha256))
             evict(self.folder, path.suffix, self.limit_bytes, keep=path)
         return path
 
@@ -73,7 +73,7 @@ class ShardCache:
             return False
         return True
 
-    def _checked(self, store: Store, key: str, sha256: str) -> Iterator[bytes]:
+    def _download(self, store: Store, key: str, sha256: str) -> Iterator[bytes]:
         # In a fork, requests to a remote store never return.
         if os.getpid() != self._process and not store.url.startswith(("file:", "memory:")):
             fix = "start new processes: DataLoader(..., multiprocessing_context='spawn')"
@@ -106,7 +106,7 @@ class Shards:
     def _by_id(self) -> dict[str, ShardFile]:
         return {file.id: file for file in self.files}
 
-    def of(self, kind: str) -> tuple[ShardFile, ...]:
+    def of_kind(self, kind: str) -> tuple[ShardFile, ...]:
         return tuple(file for file in self.files if file.kind == kind)
 
     def by_id(self, shard: str) -> ShardFile:
@@ -115,7 +115,7 @@ class Shards:
             raise NotFoundError(f"shard {shard[:12]} is not among the {len(self)} shards given")
         return self._by_id[shard]
 
-    def only(self, *, hands: Iterable[str] = (), objects: Iterable[str] = ()) -> Shards:
+    def select(self, *, hands: Iterable[str] = (), objects: Iterable[str] = ()) -> Shards:
         """Select the shards of some hands and objects, by default of all."""
         of_hands, of_objects = set(hands), set(objects)
         found = [file for file in self.files if not of_hands or file.hand in of_hands]
@@ -158,13 +158,13 @@ def open_shards(
     """
     if isinstance(source, Store) or (isinstance(source, str) and "://" in source):
         store = source if isinstance(source, Store) else open_store(source, make=False)
-        found = _ordered(_shards_of_store(store, job, dataset, snapshot))
+        found = _sort_files(_shards_of_store(store, job, dataset, snapshot))
         return Shards(found, store, ShardCache(cache or cache_folder("shards"), limit_bytes=cache_bytes))
     given = [source] if isinstance(source, str | Path) else list(source)
-    return Shards(_ordered(_shard_file(path) for entry in given for path in _paths(Path(entry))))
+    return Shards(_sort_files(_shard_file(path) for entry in given for path in _shard_paths(Path(entry))))
 
 
-def _paths(entry: Path) -> list[Path]:
+def _shard_paths(entry: Path) -> list[Path]:
     if entry.is_dir():
         found = sorted(entry.rglob("*.h5"))
         if any(entry.rglob("*.pack")):
@@ -179,7 +179,7 @@ def _paths(entry: Path) -> list[Path]:
 
 def _shard_file(path: Path) -> ShardFile:
     with open_shard(path) as file:
-        kind, attributes = kind_of(file, str(path)), dict(file.attrs)
+        kind, attributes = shard_kind(file, str(path)), dict(file.attrs)
     name = str(attributes.get("shard_id", path.resolve()))
     hand, obj = (str(attributes.get(key, "")) for key in ("hand", "object"))
     return ShardFile(name, kind, hand, obj, int(attributes.get("batch", 0)), path=path)
@@ -211,6 +211,6 @@ def _shards_of_snapshot(store: Store, dataset: str, digest: str | None) -> Itera
         yield ShardFile(shard.id, shard.kind, shard.hand, shard.object, shard.batch, key=shard.key, sha256=shard.sha256)
 
 
-def _ordered(files: Iterable[ShardFile]) -> tuple[ShardFile, ...]:
+def _sort_files(files: Iterable[ShardFile]) -> tuple[ShardFile, ...]:
     order = list(_STAGES)
     return tuple(sorted(files, key=lambda file: (file.hand, file.object, file.batch, order.index(file.kind), file.id)))

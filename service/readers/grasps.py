@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import InputError
 from graspd.service.readers.files import ShardFile, Shards
 from graspd.service.store import validity
-from graspd.service.store.columns import SCHEMAS, check_known
+from graspd.service.store.columns import SCHEMAS, check_column_names
 from graspd.service.store.shards import open_shard, read_column
 
 Array = NDArray[Any]
@@ -61,10 +61,10 @@ class Grasps(Sequence[dict[str, Any]]):
 
         Raises InputError for an unknown column, or a mask of wrong length.
         """
-        check_known("base", columns)
+        check_column_names("base", columns)
         self.shards, self.columns = shards, tuple(columns)
         self._valid, self._unvalidated, self._where = valid, unvalidated, where
-        self._files = shards.of("base")
+        self._files = shards.of_kind("base")
         self._memory: OrderedDict[str, dict[str, Array]] = OrderedDict()
         self._rows = [self._selected_rows(file) for file in self._files]
         #: (shards,) index after the last grasp of each base shard.
@@ -107,7 +107,7 @@ class Grasps(Sequence[dict[str, Any]]):
         try:
             return {name: np.concatenate(some) if some else np.empty(0) for name, some in parts.items()}
         except ValueError as error:
-            hint = "read one hand: shards.only(...)"
+            hint = "read one hand: shards.select(...)"
             raise InputError(f"the shards do not fit into one array ({error}); {hint}") from None
 
     def _selected_rows(self, file: ShardFile) -> NDArray[np.intp]:

@@ -15,7 +15,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.readers.files import ShardFile, Shards
 from graspd.service.readers.rows import RowTable
 from graspd.service.store import validity
-from graspd.service.store.columns import check_known
+from graspd.service.store.columns import check_column_names
 from graspd.service.store.shards import open_shard, read_shard
 
 if TYPE_CHECKING:
@@ -85,14 +85,14 @@ class Pictures(Sequence[dict[str, Any]]):
 
         Raises InputError for an unknown column, NotFoundError for a missing scene or base shard.
         """
-        check_known("views", columns)
-        check_known("base", grasp_quality)
+        check_column_names("views", columns)
+        check_column_names("base", grasp_quality)
         self.shards, self.columns, self._quality = shards, tuple(columns), tuple(grasp_quality)
         self._which = {"clear": clear, "valid": valid, "unvalidated": unvalidated}
         self._scenes: OrderedDict[str, Scenes] = OrderedDict()
         self._tables: OrderedDict[str, RowTable] = OrderedDict()
         self.places: list[PictureAddress] = []
-        for file in shards.of("views"):
+        for file in shards.of_kind("views"):
             self._add(file, with_grasps_only=with_grasps_only)
 
     def __len__(self) -> int:
@@ -136,7 +136,7 @@ class Pictures(Sequence[dict[str, Any]]):
         known = table.columns if table else set()
         if table is None or not known >= set(columns):
             with open_shard(self.shards.path(file)) as opened:
-                table = RowTable.of(opened, {*columns, *known}, str(file.path or file.key))
+                table = RowTable.from_file(opened, {*columns, *known}, str(file.path or file.key))
             self._tables[file.id] = table
             if len(self._tables) > _TABLES:
                 self._tables.popitem(last=False)

@@ -24,7 +24,7 @@ _DEFLATE: Final = h5py.h5z.FILTER_DEFLATE
 
 
 @dataclass(frozen=True)
-class _Packed:
+class _PackedColumn:
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     shuffled: bool
@@ -47,13 +47,13 @@ class RowTable:
     """Columns of a shard: file positions of the rows of packed columns, values of other columns."""
 
     name: str
-    packed: dict[str, _Packed]
+    packed: dict[str, _PackedColumn]
     held: dict[str, Array]
 
     @classmethod
-    def of(cls, file: h5py.File, columns: Iterable[str], name: str) -> RowTable:
+    def from_file(cls, file: h5py.File, columns: Iterable[str], name: str) -> RowTable:
         """Read the table of an open shard, and the verified values of columns that are not packed."""
-        found = {column: _packed(file[column]) for column in columns}
+        found = {column: _packed_column(file[column]) for column in columns}
         packed = {column: places for column, places in found.items() if places is not None}
         held = {column: read_column(file, column, name) for column in found.keys() - packed}
         return cls(name, packed, held)
@@ -80,7 +80,7 @@ class RowTable:
         return found
 
 
-def _packed(dataset: h5py.Dataset) -> _Packed | None:
+def _packed_column(dataset: h5py.Dataset) -> _PackedColumn | None:
     """Return a column in the layout in which `write_shard` packs pictures; None for another layout."""
     if dataset.chunks is None or dataset.chunks != (1, *dataset.shape[1:]):
         return None
@@ -95,4 +95,4 @@ def _packed(dataset: h5py.Dataset) -> _Packed | None:
         if found.filter_mask:  # A filter was skipped for this chunk.
             return None
         places[row] = found.byte_offset, found.size
-    return _Packed(dataset.shape[1:], dataset.dtype, filters[0] == _SHUFFLE, places)
+    return _PackedColumn(dataset.shape[1:], dataset.dtype, filters[0] == _SHUFFLE, places)

@@ -26,7 +26,7 @@ from graspd.service.readers.grasps import DEFAULT_COLUMNS, Grasps, Where
 Sample = dict[str, Any]
 
 
-def tensors(sample: Sample) -> Sample:
+def to_tensors(sample: Sample) -> Sample:
     """Convert the arrays of a sample to tensors, float64 to float32; strings stay strings."""
     return {name: _tensor(value) for name, value in sample.items()}
 
@@ -43,7 +43,7 @@ def collate(samples: Sequence[Sample]) -> Sample:
 class Samples(Dataset[Sample]):
     """Map-style dataset of `Grasps`, `Pictures` or `Clouds`, for a `DataLoader` with or without workers."""
 
-    def __init__(self, source: Sequence[Sample], transform: Callable[[Sample], Sample] = tensors) -> None:
+    def __init__(self, source: Sequence[Sample], transform: Callable[[Sample], Sample] = to_tensors) -> None:
         self._source, self._transform = source, transform
 
     def __len__(self) -> int:
@@ -72,7 +72,7 @@ class ShuffledShards(IterableDataset[Sample]):
         seed: int = 0,
         rank: int = 0,
         ranks: int = 1,
-        transform: Callable[[Sample], Sample] = tensors,
+        transform: Callable[[Sample], Sample] = to_tensors,
     ) -> None:
         """Args:
         shards: see `open_shards`.
@@ -94,7 +94,7 @@ class ShuffledShards(IterableDataset[Sample]):
         worker = get_worker_info()
         number, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
         share, shares = self._rank * workers + number, self._ranks * workers
-        files = self._shards.of("base")
+        files = self._shards.of_kind("base")
         order = np.random.default_rng([self._seed, self.epoch]).permutation(len(files))[share::shares]
         draw = np.random.default_rng([self._seed, self.epoch, share])
         held: list[Sample] = []
@@ -103,12 +103,12 @@ class ShuffledShards(IterableDataset[Sample]):
             for sample in Grasps(shard, self._columns, **self._selection):
                 held.append(sample)
                 if len(held) > self._buffer:
-                    yield self._transform(_draw(held, draw))
+                    yield self._transform(_pop_random(held, draw))
         while held:
-            yield self._transform(_draw(held, draw))
+            yield self._transform(_pop_random(held, draw))
 
 
-def _draw(held: list[Sample], draw: np.random.Generator) -> Sample:
+def _pop_random(held: list[Sample], draw: np.random.Generator) -> Sample:
     at = int(draw.integers(len(held)))
     held[at], held[-1] = held[-1], held[at]
     return held.pop()

@@ -40,11 +40,11 @@ def trajectory_of(shard: Shard, row: int) -> list[Waypoint]:
     """
     rest = np.zeros(3)
 
-    def posture(name: str) -> Waypoint:
+    def posture_waypoint(name: str) -> Waypoint:
         pose, joints = (np.asarray(shard[f"{name}/{part}"][row], float) for part in ("hand_pose", "joint_positions"))
         return Waypoint(name, pose, joints, rest)
 
-    way = [posture("pregrasp"), posture("grasp"), posture("squeeze")]
+    way = [posture_waypoint("pregrasp"), posture_waypoint("grasp"), posture_waypoint("squeeze")]
     if "grasp/approach" in shard.arrays:
         joints = np.asarray(shard["grasp/approach_joint_positions"][row], float)
         poses = np.asarray(shard["grasp/approach"][row], float)
@@ -61,7 +61,7 @@ def slider_positions(way: Sequence[Waypoint]) -> Floats:
     return np.interp(np.arange(len(way)), stops, np.arange(len(stops)))
 
 
-def point_at(way: Sequence[Waypoint], place: float) -> Waypoint:
+def waypoint_at(way: Sequence[Waypoint], place: float) -> Waypoint:
     """Interpolate the posture at a slider position: linear for positions and joints, slerp for rotations."""
     places = slider_positions(way)
     place = float(np.clip(place, places[0], places[-1]))
@@ -69,16 +69,16 @@ def point_at(way: Sequence[Waypoint], place: float) -> Waypoint:
     a, b = way[k], way[k + 1]
     share = (place - places[k]) / (places[k + 1] - places[k])
 
-    def mix(first: Floats, second: Floats) -> Floats:
+    def interpolate(first: Floats, second: Floats) -> Floats:
         return np.asarray((1 - share) * first + share * second)
 
     turn = slerp(a.hand_pose[3:], b.hand_pose[3:], float(share))
     name = a.name if share == 0 else b.name if share == 1 else ""
-    pose = np.concatenate([mix(a.hand_pose[:3], b.hand_pose[:3]), turn])
-    return Waypoint(name, pose, mix(a.joint_positions, b.joint_positions), mix(a.carried, b.carried))
+    pose = np.concatenate([interpolate(a.hand_pose[:3], b.hand_pose[:3]), turn])
+    return Waypoint(name, pose, interpolate(a.joint_positions, b.joint_positions), interpolate(a.carried, b.carried))
 
 
-def wrists_of(shard: Shard, rows: NDArray[np.integer[Any]]) -> Floats | None:
+def wrist_angles(shard: Shard, rows: NDArray[np.integer[Any]]) -> Floats | None:
     """Return the angles (N, U) of wrist joints above the hand's root [rad]; None if the shard has none."""
     angles = shard.arrays.get("grasp/wrist_positions")
     return None if angles is None else np.asarray(angles, float)[rows]

@@ -34,21 +34,21 @@ _FLAGS: Final = {"held": "quality/success", "lift": "quality/lift_outcome", "lif
 def compile_expression(text: str) -> Test:
     """Compile an expression, or raise InputError; comparisons with a missing metric or nan are false."""
     tree = parse_where(text)
-    return lambda columns, said: _mask(tree, columns, said)
+    return lambda columns, said: _evaluate(tree, columns, said)
 
 
-def _mask(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any]) -> Mask:
+def _evaluate(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any]) -> Mask:
     count = len(columns["quality/valid"])
     if isinstance(node, Connective):
         join = or_ if node.word == "or" else and_
-        return reduce(join, (_mask(part, columns, said) for part in node.parts))
+        return reduce(join, (_evaluate(part, columns, said) for part in node.parts))
     if isinstance(node, Negation):
-        return ~_mask(node.part, columns, said)
+        return ~_evaluate(node.part, columns, said)
     if isinstance(node, Flag):
-        return _flag(node.name, columns)
+        return _status_mask(node.name, columns)
     compare = _OPERATORS[node.op]
     if isinstance(node, MetricComparison):
-        values = value_of(_METRICS[node.name], columns)
+        values = metric_values(_METRICS[node.name], columns)
         with np.errstate(invalid="ignore"):
             return np.isfinite(values) & np.asarray(compare(values, node.bound))
     if isinstance(node, TypeComparison):
@@ -57,14 +57,14 @@ def _mask(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any]) -> 
     return np.full(count, bool(compare(str(said.get(node.name, "")), node.word)))
 
 
-def _flag(name: str, columns: Mapping[str, Array]) -> Mask:
+def _status_mask(name: str, columns: Mapping[str, Array]) -> Mask:
     if name in _STATUSES:
         return _STATUSES[name](columns)
     path = _FLAGS[name]
     return np.asarray(columns[path]) == 1 if path in columns else np.zeros(len(columns["quality/valid"]), bool)
 
 
-def value_of(metric: GraspMetric, columns: Mapping[str, Array]) -> NDArray[np.float64]:
+def metric_values(metric: GraspMetric, columns: Mapping[str, Array]) -> NDArray[np.float64]:
     """Return a metric (N,) of the grasps of a base shard; nan if the shard does not have it."""
     if metric.path not in columns:
         return np.full(len(columns["quality/valid"]), np.nan)

@@ -37,7 +37,7 @@ def local_url(host: str, port: int) -> str:
     return f"http://{shown}:{port}"
 
 
-def bind(host: str, port: int) -> socket.socket:
+def bind_socket(host: str, port: int) -> socket.socket:
     """Bind a socket to a port (0: a free port). BusyError: port in use. InputError: unusable address.
 
     While the socket is open, the API of a child process can listen on the port, and no other process gets the port.
@@ -58,7 +58,7 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def forget_address(folder: Path) -> None:
-    record = _read(folder)
+    record = _read_record(folder)
     if record is not None and record[1] == os.getpid():
         with contextlib.suppress(OSError):
             (folder / _FILE).unlink(missing_ok=True)
@@ -66,11 +66,11 @@ def forget_address(folder: Path) -> None:
 
 def recorded_address(folder: Path) -> str | None:
     """Return the recorded URL of a data folder's service; None without a record of a living process."""
-    record = _read(folder)
+    record = _read_record(folder)
     return record[0] if record is not None and start_time(record[1]) == record[2] else None
 
 
-def _read(folder: Path) -> tuple[str, int, str] | None:
+def _read_record(folder: Path) -> tuple[str, int, str] | None:
     try:
         file = folder / _FILE
         # The file of another user could direct this user's key to a foreign server.

@@ -71,7 +71,7 @@ class Child:
         self.starts += 1
         self._started = time.monotonic()
 
-    def watch(self) -> None:
+    def restart_if_ended(self) -> None:
         """Restart the process if it has ended, after a pause that doubles with each further failure."""
         now = time.monotonic()
         if self.process is not None:
@@ -91,7 +91,7 @@ class Child:
         elif now >= self._not_before:
             self.start()
 
-    def ask_to_stop(self) -> None:
+    def terminate(self) -> None:
         if self.process is not None and self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
 
@@ -119,13 +119,13 @@ def keep_alive(children: Sequence[Child], stop: threading.Event) -> None:
         child.start()
     while not stop.wait(_WATCH_S):
         for child in children:
-            child.watch()
+            child.restart_if_ended()
 
 
 def stop_children(children: Sequence[Child], grace_s: float) -> None:
     """Ask all children to stop; kill those that still run after the grace time [s]."""
     for child in children:
-        child.ask_to_stop()
+        child.terminate()
     deadline = time.monotonic() + grace_s
     for child in children:
         child.join(deadline)

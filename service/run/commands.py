@@ -111,14 +111,14 @@ def _run_controller(settings: Settings, stop: threading.Event) -> None:
     with closing(open_queue(settings, patience=0)) as queue:
         leadership = Leadership(queue, lease_s=settings.lease_s, alive=alive, name=settings.controller_name)
         # A controller of another service must not stand by here, because it could lead this service later.
-        _identify(settings, stop, alive)
+        _check_identity(settings, stop, alive)
         while leadership.wait(stop):
             # A new controller again receives unfinished events of its predecessor.
             with leadership.hold(stop) as over, closing(Services.open(settings)) as services:
                 Controller(services).run(over)
 
 
-def _identify(settings: Settings, stop: threading.Event, alive: HeartbeatFile) -> None:
+def _check_identity(settings: Settings, stop: threading.Event, alive: HeartbeatFile) -> None:
     """Check that store, index and Redis belong to one service (else BusyError), once Redis answers."""
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.identity import identify
@@ -150,7 +150,7 @@ def rebuild(
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.identity import identify_if_redis_answers
     from graspd.service.pipeline.integrity import scan
-    from graspd.service.store.packs import unpack_all
+    from graspd.service.store.packs import convert_packs
 
     settings = load_settings(data_dir=data_dir)
     if check:
@@ -160,7 +160,7 @@ def rebuild(
 
     def make() -> dict[str, int]:
         identify_if_redis_answers(services, take_over=True)
-        for _ in unpack_all(store):
+        for _ in convert_packs(store):
             pass
         return fill(index, store)
 

@@ -49,7 +49,7 @@ def server_command(settings: Settings, joining: ListenAddress | None = None) -> 
     folder = settings.data_dir.resolve() / "redis"
     socket = socket_path(settings.data_dir)
     for private in {folder, socket.parent}:
-        _private_folder(private)
+        _make_private_folder(private)
     options = {
         "port": "0",
         "unixsocket": str(socket),
@@ -78,7 +78,7 @@ def server_command(settings: Settings, joining: ListenAddress | None = None) -> 
 def lock_redis(settings: Settings) -> IO[str]:
     """Lock a data folder's Redis until the returned file is closed; BusyError if another process runs it."""
     folder = settings.data_dir.resolve() / "redis"
-    _private_folder(folder)
+    _make_private_folder(folder)
     return lock_file(folder / "lock", f"the Redis of {settings.data_dir}")
 
 
@@ -100,7 +100,7 @@ def move_log(settings: Settings, why: str) -> None:
     folder = settings.data_dir.resolve() / "redis"
     aside = folder / f"aside-{datetime.now(UTC):%Y%m%dT%H%M%S%f}"
     if found := [one for name in _LOGS if (one := folder / name).exists()]:
-        _private_folder(aside)
+        _make_private_folder(aside)
         for one in found:
             one.rename(aside / one.name)
         log.warning(
@@ -124,7 +124,7 @@ def lock_file(path: Path, what: str) -> IO[str]:
     return file
 
 
-def _private_folder(folder: Path) -> None:
+def _make_private_folder(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     status = folder.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():

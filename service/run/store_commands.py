@@ -87,11 +87,11 @@ def verify(
 @store_app.command(epilog="graspd admin store upgrade")
 def upgrade(data_dir: DataDir = None, json: JsonFlag = False) -> None:
     """Replace packs of graspd 0.2 by one file per shard; a controller does the same at its start."""
-    from graspd.service.store.packs import unpack_all
+    from graspd.service.store.packs import convert_packs
     from graspd.service.store.store import open_store
 
     store = open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False)
-    shards = sum(1 for _ in unpack_all(store))
+    shards = sum(1 for _ in convert_packs(store))
     if json:
         print_json({"shards": shards})
     else:

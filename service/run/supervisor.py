@@ -23,7 +23,7 @@ from graspd.service.pipeline.identity import identify_if_redis_answers, recorded
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.connection import redis_url
 from graspd.service.queue.rq_queue import RqQueue, open_queue
-from graspd.service.run.address import ListenAddress, bind, forget_address, local_url, record_address
+from graspd.service.run.address import ListenAddress, bind_socket, forget_address, local_url, record_address
 from graspd.service.run.children import Child, keep_alive, kill_leftovers, stop_children
 from graspd.service.run.embedded import find_server, lock_file, lock_redis, move_broken_log, move_log, server_command
 from graspd.service.settings import Settings
@@ -93,9 +93,9 @@ class Supervisor:
             if leftovers := kill_leftovers(folder):
                 log.warning("ended %d processes that an earlier graspd left behind", len(leftovers))
             self._resolve_settings()
-            self._identify(folder)
-            self._children = self._plan()
-            self._record(folder)
+            self._check_identity(folder)
+            self._children = self._create_children()
+            self._record_addresses(folder)
         except GraspdError:
             self._release()
             raise
@@ -116,16 +116,18 @@ class Supervisor:
         an external Redis does not answer. Every 15 s, `say` is called with the missing parts.
         """
         began = told = time.monotonic()
-        starts, logs = self._starts(), self.settings.data_dir / "logs"
+        starts, logs = self._start_counts(), self.settings.data_dir / "logs"
         with closing(open_queue(self.settings, patience=0)) as queue:
             while missing := self._missing_parts(queue):
                 if stop is not None and stop.is_set():
                     return False
                 if "redis" in missing:  # Without Redis, other processes end and are not to blame.
-                    starts = {**self._starts(), "redis": starts.get("redis", 0)}
+                    starts = {**self._start_counts(), "redis": starts.get("redis", 0)}
                 now = time.monotonic()
                 patience = min(timeout, _REDIS_S) if "redis" in missing and self._wanted.redis_url else timeout
-                if again := [name for name, count in self._starts().items() if count - starts.get(name, 0) >= _ENDS]:
+                if again := [
+                    name for name, count in self._start_counts().items() if count - starts.get(name, 0) >= _ENDS
+                ]:
                     raise UnavailableError(f"{', '.join(again)} ended {_ENDS} times before getting ready; see {logs}")
                 if now - began > patience or self._stopping.is_set():
                     raise UnavailableError(f"not ready after {now - began:.0f} s: {', '.join(missing)}; see {logs}")
@@ -143,7 +145,7 @@ class Supervisor:
             self._thread = None
         self._release()
 
-    def _starts(self) -> dict[str, int]:
+    def _start_counts(self) -> dict[str, int]:
         return {child.name: child.starts for child in list(self._children)}
 
     def _missing_parts(self, queue: RqQueue) -> list[str]:
@@ -170,7 +172,7 @@ class Supervisor:
         folder = self._wanted.data_dir.resolve()
         update: dict[str, object] = {"data_dir": folder}
         if self._api:
-            reserved = bind(self._wanted.host, self._wanted.port)
+            reserved = bind_socket(self._wanted.host, self._wanted.port)
             update["port"] = reserved.getsockname()[1]
             if sys.platform == "linux":
                 self._locks.append(reserved)
@@ -178,7 +180,7 @@ class Supervisor:
                 reserved.close()
         self.settings = self._wanted.model_copy(update=update)
 
-    def _identify(self, folder: Path) -> None:
+    def _check_identity(self, folder: Path) -> None:
         """Check that store, index and Redis belong to one service; without Redis the children check it later."""
         open_store(self.settings.resolved_store_url)
         before = recorded_service(folder)
@@ -192,7 +194,7 @@ class Supervisor:
         if self._wanted.redis_url is None and before not in (None, mine):
             move_log(self.settings, "it belongs to the service that ran here before")
 
-    def _plan(self) -> list[Child]:
+    def _create_children(self) -> list[Child]:
         environment = {
             "GRASPD_DATA_DIR": str(self.settings.data_dir),
             "GRASPD_REDIS_URL": self._joining.redis_url if self._joining else redis_url(self.settings),
@@ -233,7 +235,7 @@ class Supervisor:
                 group = [child for child in self._children if child.name.startswith(names)]
                 stop_children(group, self.settings.stop_grace_s)
 
-    def _record(self, folder: Path) -> None:
+    def _record_addresses(self, folder: Path) -> None:
         if self._joining is not None:
             self._joining.write(self.settings, self.api_url)
         try:
@@ -258,10 +260,10 @@ _SETTLED: Final = frozenset({"data_dir", "redis_url", "host", "port", "api_url"}
 def _explicit_settings(settings: Settings) -> dict[str, str]:
     """Return the explicitly given settings, for the environment of the children."""
     given = settings.model_fields_set - _SETTLED
-    return {f"GRASPD_{name.upper()}": _as_variable(getattr(settings, name)) for name in given}
+    return {f"GRASPD_{name.upper()}": _variable_text(getattr(settings, name)) for name in given}
 
 
-def _as_variable(value: object) -> str:
+def _variable_text(value: object) -> str:
     """Format a setting for the environment; "" means unset."""
     if isinstance(value, SecretStr):
         return value.get_secret_value()

@@ -17,7 +17,7 @@ from graspd.service.model.options import Option
 _TYPED: Final = Option(places=ASSET)
 
 
-class HandWords(Model):
+class HandCommandOptions(Model):
     urdf: Annotated[str | None, _TYPED] = Field(
         None, description="main file of the hand in the folder or ZIP (URDF, xacro or MJCF): NAME"
     )
@@ -38,7 +38,7 @@ class HandWords(Model):
     drop: Annotated[tuple[str, ...], _TYPED] = Field((), description="link to remove, with all its descendants")
 
 
-class SweptOptions(ObjectOptions):
+class ObjectSizeOptions(ObjectOptions):
     """Options of an object, with several sizes for `--scale-to`."""
 
     scale_to: Annotated[str | None, _TYPED] = Field(  # type: ignore[assignment]
@@ -55,24 +55,24 @@ def provenance(licence: str | None, source: str | None) -> dict[str, Any]:
 
 
 def hand_options(**given: Any) -> dict[str, Any]:
-    """Convert options of `HandWords` to keys of a hand's `asset.json`; omit absent options."""
-    words = HandWords(**given)
+    """Convert options of `HandCommandOptions` to keys of a hand's `asset.json`; omit absent options."""
+    words = HandCommandOptions(**given)
     options: dict[str, Any] = {
         "file": words.urdf,
-        "xacro": dict(map(_argument, words.xacro)),
+        "xacro": dict(map(_parse_xacro_argument, words.xacro)),
         "palm": {"link": words.palm} if words.palm else None,
-        "approach": _vector(words.approach) if words.approach else None,
+        "approach": _parse_vector(words.approach) if words.approach else None,
         "root": words.root,
-        "preshape": _assignments("--pre-shape", words.pre_shape) if words.pre_shape else None,
-        "closing": _directions(words.closing) if words.closing else None,
+        "preshape": _parse_assignments("--pre-shape", words.pre_shape) if words.pre_shape else None,
+        "closing": _parse_closing(words.closing) if words.closing else None,
         "fingertips": [link for part in (words.fingertips or "").split(",") if (link := part.strip())],
-        "fix": _assignments("--fix", words.fix) if words.fix else None,
+        "fix": _parse_assignments("--fix", words.fix) if words.fix else None,
         "drop": list(words.drop),
     }
     return {key: value for key, value in options.items() if value}
 
 
-def sizes_of(text: str | None) -> tuple[float, ...]:
+def parse_sizes(text: str | None) -> tuple[float, ...]:
     """Parse the distinct sizes of `--scale-to` [m]."""
     try:
         sizes = tuple(dict.fromkeys(float(part) for part in text.split(","))) if text else ()
@@ -83,7 +83,7 @@ def sizes_of(text: str | None) -> tuple[float, ...]:
     return sizes
 
 
-def _vector(text: str) -> list[float]:
+def _parse_vector(text: str) -> list[float]:
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
@@ -91,7 +91,7 @@ def _vector(text: str) -> list[float]:
     return [x, y, z]
 
 
-def _assignments(option: str, texts: Sequence[str]) -> dict[str, float]:
+def _parse_assignments(option: str, texts: Sequence[str]) -> dict[str, float]:
     values: dict[str, float] = {}
     for text in ",".join(texts).split(","):
         name, _, value = text.strip().partition("=")
@@ -102,15 +102,15 @@ def _assignments(option: str, texts: Sequence[str]) -> dict[str, float]:
     return values
 
 
-def _argument(text: str) -> tuple[str, str]:
+def _parse_xacro_argument(text: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not name or not equals:
         raise InputError(f"--xacro {text!r} must be NAME=VALUE")
     return name, value
 
 
-def _directions(texts: Sequence[str]) -> dict[str, int]:
-    values = _assignments("--closing", texts)
+def _parse_closing(texts: Sequence[str]) -> dict[str, int]:
+    values = _parse_assignments("--closing", texts)
     for name, value in values.items():
         if value not in (-1, 0, 1):
             raise InputError(f"--closing {name}={value:g} must be -1, 0 or 1")

@@ -29,7 +29,7 @@ def verdict_line(asset: Mapping[str, Any]) -> str:
 
 
 def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
-    pairs = {AssetKind.HAND: _hand, AssetKind.OBJECT: _object, AssetKind.NETWORK: _network}[kind](facts)
+    pairs = {AssetKind.HAND: _hand_rows, AssetKind.OBJECT: _object_rows, AssetKind.NETWORK: _network_rows}[kind](facts)
     return [f"{label:<18} {text}" for label, text in pairs]
 
 
@@ -38,7 +38,7 @@ def self_test_line(facts: Mapping[str, Any]) -> str:
     return str(_mapping(facts, "self_test").get("says", ""))
 
 
-def limit_line(facts: Mapping[str, Any]) -> str:
+def payload_line(facts: Mapping[str, Any]) -> str:
     return str(_mapping(_mapping(facts, "self_test"), "limit").get("says", ""))
 
 
@@ -48,7 +48,7 @@ def _mapping(facts: Mapping[str, Any], key: str) -> Mapping[str, Any]:
 
 def self_test_lines(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return labels and texts of the self-test: its result, and the payload of the hand."""
-    lines = [("self-test", self_test_line(facts)), ("payload", limit_line(facts))]
+    lines = [("self-test", self_test_line(facts)), ("payload", payload_line(facts))]
     return [(label, text) for label, text in lines if text]
 
 
@@ -56,11 +56,11 @@ def hand_line(facts: Mapping[str, Any]) -> str:
     return f"{facts.get('hand', '')} ({str(facts.get('hand_digest', ''))[:12]})"
 
 
-def _hand(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def _hand_rows(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     guessed = facts.get("guessed", [])
     if "palm_centre" in facts:
-        yield "palm", f"{facts.get('root', '')} at {_vector(facts['palm_centre'], 1e3)} mm"
-        yield "approach", _vector(facts["palm_approach"])
+        yield "palm", f"{facts.get('root', '')} at {_vector_text(facts['palm_centre'], 1e3)} mm"
+        yield "approach", _vector_text(facts["palm_approach"])
     if "fingertips" in facts:
         yield "fingertips", ", ".join(facts["fingertips"])
     if "opening_m" in facts:
@@ -68,21 +68,21 @@ def _hand(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield from self_test_lines(facts)
     if "dofs" in facts:
         yield "dofs", f"{len(facts['dofs'])}, driving {len(facts.get('joints', []))} joints"
-        yield from (("", _dof(name, facts)) for name in facts["dofs"])
+        yield from (("", _dof_text(name, facts)) for name in facts["dofs"])
     fix = [_OVERRIDES[key] for key in guessed if key in _OVERRIDES]
     if guessed:
         yield "guessed", f"{', '.join(guessed)}{'; override: ' + ' '.join(fix) if fix else ''}"
 
 
-def _dof(name: str, facts: Mapping[str, Any]) -> str:
-    limits = f"{_angle(facts['lower'][name])} .. {_angle(facts['upper'][name])}"
+def _dof_text(name: str, facts: Mapping[str, Any]) -> str:
+    limits = f"{_angle_text(facts['lower'][name])} .. {_angle_text(facts['upper'][name])}"
     closing = {1: "closes +", -1: "closes -", 0: "spreads"}[facts["closing"][name]]
-    return f"{name:<32} {limits:<18} {closing:<9} pre-shape {_angle(facts['preshape'][name])}"
+    return f"{name:<32} {limits:<18} {closing:<9} pre-shape {_angle_text(facts['preshape'][name])}"
 
 
-def _object(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def _object_rows(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if "extents_m" in facts:
-        yield "size", f"{_vector(facts['extents_m'], 1e3)} mm, read as {facts.get('units', 'm')}"
+        yield "size", f"{_vector_text(facts['extents_m'], 1e3)} mm, read as {facts.get('units', 'm')}"
     if "prepared_faces" in facts:
         faces = f"{facts['faces']} faces, simplified to {facts['prepared_faces']}"
         yield "mesh", f"{faces}; largest surface deviation {1e3 * facts['deviation_m']:.2f} mm"
@@ -97,7 +97,7 @@ def _object(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "volume", f"{1e6 * facts['volume_m3']:.1f} cm3" + (f", {mass:.3g} kg{assumed}" if mass else "")
 
 
-def _network(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def _network_rows(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if "hand_digest" in facts:
         yield "hand", f"{facts.get('hand', '')} {facts['hand_digest']}, {facts.get('joints', 0)} joints"
     if "points" in facts:
@@ -108,9 +108,9 @@ def _network(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "about", str(facts["about"])
 
 
-def _vector(values: Sequence[float], scale: float = 1.0) -> str:
+def _vector_text(values: Sequence[float], scale: float = 1.0) -> str:
     return "(" + ", ".join(f"{scale * value:.4g}" for value in values) + ")"
 
 
-def _angle(value: float) -> str:
+def _angle_text(value: float) -> str:
     return "0" if math.isclose(value, 0, abs_tol=5e-4) else f"{value:.2f}"

@@ -67,7 +67,7 @@ def unpack_file(path: Path) -> dict[str, bytes]:
         raise type(error)(f"{path}: {error}") from None
 
 
-def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
+def strip_common_folder(files: dict[str, _T]) -> dict[str, _T]:
     """Remove the first folder from all names, if all files are in that folder."""
     tops = {name.partition("/")[0] for name in files}
     if len(tops) == 1 and all("/" in name for name in files):
@@ -80,7 +80,7 @@ class ZipFiles(MutableMapping[str, bytes]):
 
     def __init__(self, file: IO[bytes], *, limit_bytes: int) -> None:
         self._archive = _open_zip(file)
-        self._found = _entries(self._archive)
+        self._found = _checked_entries(self._archive)
         self._added: dict[str, bytes] = {}
         self._known: dict[str, tuple[int, str]] = {}
         left = limit_bytes
@@ -90,9 +90,9 @@ class ZipFiles(MutableMapping[str, bytes]):
             if left < 0:
                 raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
 
-    def without_common_folder(self) -> Self:
-        self._found = without_common_folder(self._found)
-        self._known = without_common_folder(self._known)
+    def strip_common_folder(self) -> Self:
+        self._found = strip_common_folder(self._found)
+        self._known = strip_common_folder(self._known)
         return self
 
     def digest(self, name: str) -> str:
@@ -133,7 +133,7 @@ def _open_zip(file: IO[bytes]) -> zipfile.ZipFile:
         raise InputError("the archive is not a readable ZIP file; zip the folder again") from None
 
 
-def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+def _checked_entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     if len(entries) > MAX_FILES:
         raise LimitError(f"the archive holds {len(entries)} files; at most {MAX_FILES} are allowed")

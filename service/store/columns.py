@@ -14,7 +14,7 @@ ShardKind = Literal["base", "scene", "views"]
 _VERSIONS: Final[dict[str, int]] = {"base": 2, "scene": 1, "views": 1}
 
 
-def schema_of(kind: str) -> str:
+def schema_name(kind: str) -> str:
     return f"graspd/{kind}@{_VERSIONS[kind]}"
 
 
@@ -38,7 +38,7 @@ _BOUNDS = "x_min y_min x_max y_max of the"
 _REJECTIONS = "insufficient clearance: 0 none, 1 table at contact, 2 on approach, 3 neighbour at contact, 4 on approach"
 
 
-def _posture(prefix: str, what: str) -> dict[str, Column]:
+def _posture_columns(prefix: str, what: str) -> dict[str, Column]:
     return {
         f"{prefix}/hand_pose": Column("N 7", "f8", "m, 1", "object", f"{what}: {_POSE}"),
         f"{prefix}/joint_positions": Column(
@@ -51,11 +51,11 @@ def _optional_column(shape: str, dtype: str, units: str, frame: str, description
     return Column(shape, dtype, units, frame, description, optional=True)
 
 
-def _flag(description: str, dtype: str = "i1") -> Column:
+def _flag_column(description: str, dtype: str = "i1") -> Column:
     return _optional_column("N", dtype, "bool", "none", description)
 
 
-def _code(description: str, shape: str = "N", *, outcomes: Mapping[Any, str] | None = None) -> Column:
+def _code_column(description: str, shape: str = "N", *, outcomes: Mapping[Any, str] | None = None) -> Column:
     if outcomes:
         description += ", ".join(f"{int(code)} {meaning}" for code, meaning in outcomes.items())
     return _optional_column(shape, "u1", "enum", "none", description)
@@ -69,38 +69,40 @@ _LIFT_OUTCOMES = ("not tested", "lifted", "penetration", "contact on the approac
 LIFT_OUTCOMES: Final = dict(enumerate((*_LIFT_OUTCOMES, "rotated", "diverged", "neighbour moved")))
 
 
-def _wrist(rows: str) -> Column:
+def _wrist_column(rows: str) -> Column:
     description = "collision-free angles of wrist joints above the hand's root, order in attribute wrist_joint_names"
     return _optional_column(f"{rows} U", "f8", "rad", "joint", description)
 
 
-def _measured(*, optional: bool) -> dict[str, Column]:
-    def column(metric: GraspMetric) -> Column:
+def _metric_columns(*, optional: bool) -> dict[str, Column]:
+    def metric_column(metric: GraspMetric) -> Column:
         shape, dtype = "N T" if metric.swept else "N", "i4" if metric.whole else "f8"
         return Column(shape, dtype, metric.units, "none", metric.meaning, optional)
 
-    return {metric.path: column(metric) for metric in GRASP_METRICS if metric.optional == optional}
+    return {metric.path: metric_column(metric) for metric in GRASP_METRICS if metric.optional == optional}
 
 
 SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
     "base": {
-        **_posture("grasp", "posture at contact"),
-        **_posture("pregrasp", "posture before contact, fingers clear of the object"),
-        **_posture("squeeze", "commanded posture that presses on the object"),
+        **_posture_columns("grasp", "posture at contact"),
+        **_posture_columns("pregrasp", "posture before contact, fingers clear of the object"),
+        **_posture_columns("squeeze", "commanded posture that presses on the object"),
         "quality/thresholds_m": Column("T", "f8", "m", "none", "contact thresholds of the sweep"),
-        **_measured(optional=False),
+        **_metric_columns(optional=False),
         "quality/valid": Column("N", "u1", "bool", "none", "1: feasible, and held in validation; 0: other"),
-        "quality/feasible": _flag("1: within the geometric limits of penetration and contact", "u1"),
-        "quality/success": _flag("verdict at the level of attribute verdict_level: 1 held, 0 dropped, -1 not tested"),
-        "quality/verdict_outcome": _code("outcome per push +x -x +y -y +z -z: ", "N D", outcomes=PUSH_OUTCOMES),
+        "quality/feasible": _flag_column("1: within the geometric limits of penetration and contact", "u1"),
+        "quality/success": _flag_column(
+            "verdict at the level of attribute verdict_level: 1 held, 0 dropped, -1 not tested"
+        ),
+        "quality/verdict_outcome": _code_column("outcome per push +x -x +y -y +z -z: ", "N D", outcomes=PUSH_OUTCOMES),
         "quality/verdict_margin": _optional_column(
             "N", "f8", "1", "none", "largest ratio of motion to its limit under the pushes; below 1: held"
         ),
-        "quality/validated_by": _code("engine of `success`: 0 MuJoCo on the CPU, 1 MuJoCo Warp (the prefilter)"),
-        "quality/recheck": _flag("verdict of unmodified DexGraspBench: 1 held, 0 dropped, -1 not rechecked"),
-        "quality/published": _flag("published verdict of imported grasps: 1 held, 0 dropped, -1 none"),
-        **_measured(optional=True),
-        "quality/robust_weakest": _code(
+        "quality/validated_by": _code_column("engine of `success`: 0 MuJoCo on the CPU, 1 MuJoCo Warp (the prefilter)"),
+        "quality/recheck": _flag_column("verdict of unmodified DexGraspBench: 1 held, 0 dropped, -1 not rechecked"),
+        "quality/published": _flag_column("published verdict of imported grasps: 1 held, 0 dropped, -1 none"),
+        **_metric_columns(optional=True),
+        "quality/robust_weakest": _code_column(
             "perturbed parameter of the first model in which the grasp does not hold: 0 none, ", outcomes=AXIS_MEANINGS
         ),
         # Grasps planned in scenes also have the scene, the approach and the lift.
@@ -115,10 +117,12 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "N J", "f8", "rad or m", "joint", "joints of the open hand, order in joint_names"
         ),
         "grasp/lift": _optional_column("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}"),
-        "grasp/wrist_positions": _wrist("N"),
-        "quality/lift_outcome": _code("lift test: ", outcomes=LIFT_OUTCOMES),
-        "quality/lift_hard": _flag("lift test at half the friction: 1 lifted, 0 not, -1 not tested"),
-        "quality/pushes": _flag("pushes without the scene, in files of graspd 0.2: 1 held, 0 dropped, -1 not tested"),
+        "grasp/wrist_positions": _wrist_column("N"),
+        "quality/lift_outcome": _code_column("lift test: ", outcomes=LIFT_OUTCOMES),
+        "quality/lift_hard": _flag_column("lift test at half the friction: 1 lifted, 0 not, -1 not tested"),
+        "quality/pushes": _flag_column(
+            "pushes without the scene, in files of graspd 0.2: 1 held, 0 dropped, -1 not tested"
+        ),
     },
     "scene": {
         "scene/object_pose": Column("S 7", "f8", "m, 1", "table", "object frame at rest; table top is z = 0"),
@@ -129,12 +133,12 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "grasp/hand_pose": Column("K 7", "f8", "m, 1", "table", f"posture at contact: {_POSE}"),
         "grasp/table_clearance_m": Column("K", "f8", "m", "table", f"{_HEIGHT}, from pregrasp to grasp"),
         "grasp/valid": Column("K", "u1", "bool", "none", "1: hand clear at contact and on the approach"),
-        "grasp/rejection": _code(_REJECTIONS, "K"),
+        "grasp/rejection": _code_column(_REJECTIONS, "K"),
         "grasp/contact_table_clearance_m": _optional_column("K", "f8", "m", "table", f"{_HEIGHT}, at contact"),
         "grasp/neighbour_clearance_m": _optional_column(
             "K", "f8", "m", "table", "least signed distance of the hand from neighbours' convex hulls, at most 0.1"
         ),
-        "grasp/wrist_positions": _wrist("K"),
+        "grasp/wrist_positions": _wrist_column("K"),
         "scene/neighbour_pose": _optional_column("S M 7", "f8", "m, 1", "table", _NEIGHBOURS),
     },
     "views": {
@@ -228,7 +232,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
 }
 
 
-def check_known(kind: ShardKind, columns: Iterable[str]) -> None:
+def check_column_names(kind: ShardKind, columns: Iterable[str]) -> None:
     if unknown := set(columns) - set(SCHEMAS[kind]):
         raise InputError(f"{kind} shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them")
 

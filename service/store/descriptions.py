@@ -22,13 +22,13 @@ _MAX_NUMBER: Final = 2**53
 _BOM: Final = b"\xef\xbb\xbf"
 
 
-def _small(facts: dict[str, Any]) -> dict[str, Any]:
+def _check_facts_size(facts: dict[str, Any]) -> dict[str, Any]:
     if len(to_json(facts)) > MAX_FACTS_BYTES:
         raise ValueError(f"the facts take more than {MAX_FACTS_BYTES} bytes; leave some out")
     return facts
 
 
-class Description(BaseModel):
+class AssetDescription(BaseModel):
     """Keys of `asset.json` that the service reads. Other keys are for the worker, which validates them."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -37,22 +37,22 @@ class Description(BaseModel):
     description: str = Field("", max_length=2000)
     licence: str = Field("", max_length=500)
     source: str = Field("", max_length=2000)
-    facts: Annotated[dict[Annotated[str, Field(max_length=100)], Any], AfterValidator(_small)] = Field(
+    facts: Annotated[dict[Annotated[str, Field(max_length=100)], Any], AfterValidator(_check_facts_size)] = Field(
         default_factory=dict
     )
 
 
-def parse_description(data: bytes, what: str) -> Description:
+def parse_description(data: bytes, what: str) -> AssetDescription:
     """Parse `asset.json` of the asset `what`; InputError if it is invalid."""
-    given = json_object(data, f"{what}: asset.json")
+    given = parse_json_object(data, f"{what}: asset.json")
     try:
-        return Description.model_validate(given)
+        return AssetDescription.model_validate(given)
     except ValidationError as error:
         problem = first_error(error)
         raise InputError(f"{what}: asset.json must name the main file and have short facts: {problem}") from None
 
 
-def json_object(text: bytes | str, what: str) -> dict[str, Any]:
+def parse_json_object(text: bytes | str, what: str) -> dict[str, Any]:
     """Parse a JSON object, named `what` in messages; InputError above limits of size, depth or numbers."""
     data = text.encode(errors="replace") if isinstance(text, str) else text
     if len(data) > MAX_BYTES:
@@ -63,15 +63,15 @@ def json_object(text: bytes | str, what: str) -> dict[str, Any]:
         value = None
     if not isinstance(value, dict):
         raise InputError(f'{what} must be a JSON object such as {{"units": "mm"}}')
-    if not _is_plain(value, _MAX_DEPTH):
+    if not _is_within_limits(value, _MAX_DEPTH):
         raise InputError(f"{what} is nested more than {_MAX_DEPTH} deep, or holds a number above 2^53")
     return value
 
 
-def _is_plain(value: Any, depth: int) -> bool:
+def _is_within_limits(value: Any, depth: int) -> bool:
     if isinstance(value, dict | list):
         inner = value.values() if isinstance(value, dict) else value
-        return depth > 0 and all(_is_plain(part, depth - 1) for part in inner)
+        return depth > 0 and all(_is_within_limits(part, depth - 1) for part in inner)
     return not isinstance(value, int) or abs(value) <= _MAX_NUMBER
 
 
@@ -129,7 +129,7 @@ class HandFacts(BaseModel):
     """Those of these links that are the root or moved by a joint."""
 
 
-def facts_of(model: bytes) -> HandFacts:
+def read_hand_facts(model: bytes) -> HandFacts:
     """Read the facts in the binary glTF of a hand; ConflictError for a model of an older version."""
     try:
         (length,) = struct.unpack("<I", model[12:16])
@@ -151,7 +151,7 @@ def description_of(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 def apply_corrections(given: Mapping[str, Any], facts: HandFacts, corrections: HandCorrections) -> dict[str, Any]:
     """Return an `asset.json` with given, found and corrected values; InputError for an invalid correction."""
-    _check(facts, corrections)
+    _check_corrections(facts, corrections)
     found = description_of(facts.model_dump())
     reversed_joints = {joint for joint, sign in corrections.closing.items() if sign != facts.closing[joint]}
     preshape = {joint: value for joint, value in facts.preshape.items() if joint not in reversed_joints}
@@ -166,24 +166,26 @@ def apply_corrections(given: Mapping[str, Any], facts: HandFacts, corrections: H
     return kept | found
 
 
-def _check(facts: HandFacts, corrections: HandCorrections) -> None:
+def _check_corrections(facts: HandFacts, corrections: HandCorrections) -> None:
     for joint in (*corrections.closing, *corrections.preshape):
         if joint not in facts.dofs:
-            raise InputError(f"the hand has no joint {joint!r} of its own; there are: {_first(facts.dofs)}")
+            raise InputError(f"the hand has no joint {joint!r} of its own; there are: {_first_names(facts.dofs)}")
     for joint, value in corrections.preshape.items():
         low, high = facts.lower[joint], facts.upper[joint]
         if not low - _ROUNDING <= value <= high + _ROUNDING:
             raise InputError(f"the pre-shape of {joint!r} is {value:g}, outside its limits {low:.4g} .. {high:.4g}")
     for tip in corrections.fingertips or ():
         if tip not in facts.bodies[1:]:
-            raise InputError(f"{tip!r} is no link that a joint moves; there are: {_first(facts.bodies[1:])}")
+            raise InputError(f"{tip!r} is no link that a joint moves; there are: {_first_names(facts.bodies[1:])}")
     if (palm := corrections.palm) is None:
         return
     if palm.link not in facts.links:
-        raise InputError(f"the hand has no link {palm.link!r} at or below its root; there are: {_first(facts.links)}")
+        raise InputError(
+            f"the hand has no link {palm.link!r} at or below its root; there are: {_first_names(facts.links)}"
+        )
     if palm.approach is not None and math.hypot(*palm.approach) < _ROUNDING:
         raise InputError("the approach is no direction; give one such as 0, 0, 1")
 
 
-def _first(names: Collection[str]) -> str:
+def _first_names(names: Collection[str]) -> str:
     return ", ".join(list(names)[:8]) + (", ..." if len(names) > 8 else "")

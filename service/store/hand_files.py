@@ -14,7 +14,14 @@ from typing import Final, Literal
 
 from graspd.service.model.errors import InputError, LimitError
 from graspd.service.store.assets import MAX_FILES, ZipFiles
-from graspd.service.store.mesh_files import HEAD_BYTES, MESHES, file_references, match_name, read_reference, resolve
+from graspd.service.store.mesh_files import (
+    HEAD_BYTES,
+    MESHES,
+    file_references,
+    match_name,
+    resolve_appearance_file,
+    resolve_mesh_reference,
+)
 
 #: Names of a file that describes the hand besides its URDF; the first name takes precedence.
 DESCRIPTIONS: Final = ("asset.json", "hand.json")
@@ -30,13 +37,13 @@ _OF_PACKAGES: Final = ("urdf", "robots", "xacro", "mjcf")
 _ABOVE: Final = 4
 
 
-def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
+def find_hand_files(path: Path) -> tuple[dict[str, Path], str]:
     """Find the files of a hand, by name, and the name of its main file ("" for a folder).
 
     Names are relative to the ROS package of the main file, else to its folder. Links to files outside are ignored.
     """
     files, main = (_files_of_folder(path), "") if path.is_dir() else _files_of_description(path)
-    return files | _appearance_files(files, path.resolve() if path.is_dir() else _package(path.resolve())), main
+    return files | _appearance_files(files, path.resolve() if path.is_dir() else _package_folder(path.resolve())), main
 
 
 def _appearance_files(files: Mapping[str, Path], root: Path) -> dict[str, Path]:
@@ -47,7 +54,7 @@ def _appearance_files(files: Mapping[str, Path], root: Path) -> dict[str, Path]:
         with (root / mesh).open("rb") as file:
             head = file.read(HEAD_BYTES)
         for reference in file_references(mesh, head):
-            name = resolve(mesh, reference, lambda one: _inside(root / one, root))
+            name = resolve_appearance_file(mesh, reference, lambda one: _is_inside(root / one, root))
             if name and name not in files and name not in found:
                 found[name] = root / name
                 waiting += [name] if name.lower().endswith(".mtl") else []
@@ -65,7 +72,7 @@ def _files_of_folder(folder: Path) -> dict[str, Path]:
 def _files_below(folder: Path, root: Path) -> dict[str, Path]:
     files: dict[str, Path] = {}
     for file in sorted(folder.rglob("*")):
-        if (file.suffix.lower() in _TAKEN or file.name in DESCRIPTIONS) and _inside(file, root):
+        if (file.suffix.lower() in _TAKEN or file.name in DESCRIPTIONS) and _is_inside(file, root):
             files[file.relative_to(root).as_posix()] = file
             if len(files) > MAX_FILES:
                 raise LimitError(f"{folder} holds more than {MAX_FILES} files; give the folder of one hand")
@@ -74,7 +81,7 @@ def _files_below(folder: Path, root: Path) -> dict[str, Path]:
 
 def _files_of_description(path: Path) -> tuple[dict[str, Path], str]:
     path = path.resolve() if path.is_file() else path
-    root = _package(path)
+    root = _package_folder(path)
     main = path.relative_to(root).as_posix()
     if path.is_file() and format_of(path.name, path.read_bytes()) == "xacro":
         # The files that a xacro includes are unknown until its expansion.
@@ -83,12 +90,12 @@ def _files_of_description(path: Path) -> tuple[dict[str, Path], str]:
         files = {name: root / name for name in sorted(_referenced_files(path, root))}
     for note in DESCRIPTIONS:
         for folder in (root, path.parent):
-            if _inside(folder / note, root):
+            if _is_inside(folder / note, root):
                 files[note] = folder / note
     return {main: path, **files}, main
 
 
-def _package(path: Path) -> Path:
+def _package_folder(path: Path) -> Path:
     for folder in list(path.parents)[:_ABOVE]:
         if (folder / "package.xml").is_file():
             return folder
@@ -101,7 +108,7 @@ def _referenced_files(path: Path, root: Path) -> set[str]:
     bases, folders, references = set(), {""}, set()
     while waiting:
         file = waiting.pop()
-        text = text_of(file.read_bytes())
+        text = decode_text(file.read_bytes())
         bases.add(file.parent.relative_to(root).as_posix())
         folders |= {unescape(folder) for folder in _FOLDER.findall(text)}
         references |= {unescape(reference) for reference in _REFERENCE.findall(text)}
@@ -117,7 +124,7 @@ def _referenced_files(path: Path, root: Path) -> set[str]:
 
 def _resolve_names(written: str, base: str, folder: str, root: Path) -> Iterator[str]:
     with suppress(InputError):
-        reference = read_reference(posixpath.join(folder, written), base)
+        reference = resolve_mesh_reference(posixpath.join(folder, written), base)
         if not reference.scheme or not folder:
             for name in reference.names:
                 if there := _actual_name(name, root):
@@ -126,7 +133,7 @@ def _resolve_names(written: str, base: str, folder: str, root: Path) -> Iterator
 
 def _actual_name(name: str, root: Path) -> str:
     """Return the name of a file below the root in its actual case; "" if there is no such file."""
-    if _inside(root / name, root):
+    if _is_inside(root / name, root):
         return posixpath.normpath(name)
     at = root
     for part in PurePosixPath(name).parts:
@@ -136,10 +143,10 @@ def _actual_name(name: str, root: Path) -> str:
         if not entry:
             return ""
         at /= entry
-    return at.relative_to(root).as_posix() if _inside(at, root) else ""
+    return at.relative_to(root).as_posix() if _is_inside(at, root) else ""
 
 
-def _inside(file: Path, root: Path) -> bool:
+def _is_inside(file: Path, root: Path) -> bool:
     return file.is_file() and file.resolve().is_relative_to(root.resolve())
 
 
@@ -162,7 +169,7 @@ def format_of(name: str, data: bytes) -> Format | None:
     suffix = PurePosixPath(name).suffix.lower()
     if suffix not in SUFFIXES:
         return None
-    text = text_of(data)
+    text = decode_text(data)
     found = _FORMATS_OF.get(_root_element(text[:_HEAD_BYTES]))
     if found == "urdf" and any(sign in _COMMENT.sub("", text) for sign in _MACROS):
         return "xacro"
@@ -170,7 +177,7 @@ def format_of(name: str, data: bytes) -> Format | None:
     return found or {".urdf": "urdf", ".xacro": "xacro", ".mjcf": "mjcf"}.get(suffix)  # type: ignore[return-value]
 
 
-def text_of(data: bytes) -> str:
+def decode_text(data: bytes) -> str:
     """Decode XML or YAML by byte order mark or declaration, and strip both; invalid UTF-8 is Latin 1."""
     coding: str = json.detect_encoding(data)  # By byte order mark, or by zeros among the first characters.
     if (declared := _DECLARED.match(data)) and _NAMED.match(name := declared[1].decode()):
@@ -183,11 +190,11 @@ def text_of(data: bytes) -> str:
     return _DECLARATION.sub("", text, count=1).strip("\ufeff\0 \t\r\n")
 
 
-def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the hand") -> str:
+def find_main_file(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the hand") -> str:
     """Return the name of the main file; InputError unless one file matches `wanted`, a path or its end."""
-    known = {name: kind for name in sorted(files) if (kind := format_of(name, _description_head(files, name)))}
+    known = {name: kind for name in sorted(files) if (kind := format_of(name, _read_description_head(files, name)))}
     if wanted:
-        return _match_name(wanted, [name for name in sorted(files) if name in known or name == wanted], where)
+        return _match_main_file(wanted, [name for name in sorted(files) if name in known or name == wanted], where)
     # A file that a xacro description includes may have no macros.
     kinds_of = {name: "xacro" if name.lower().endswith(".xacro") else kind for name, kind in known.items()}
     for chosen in ("urdf", "xacro", "mjcf"):
@@ -201,13 +208,13 @@ def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the h
         if found:
             names = ", ".join(found[:8]) + (", ..." if len(found) > 8 else "")
             raise InputError(
-                f"{where} holds {len(found)} hand files ({names}); name one: --urdf {_leaves(found)}, or in a ZIP an "
-                f'asset.json with {{"file": "{_leaves(found)}"}}'
+                f"{where} holds {len(found)} hand files ({names}); name one: --urdf {_shortest_name(found)}, or in a "
+                f'ZIP an asset.json with {{"file": "{_shortest_name(found)}"}}'
             )
     raise InputError(f"{where} contains no hand file; give a URDF, xacro or MJCF, or its folder or ZIP")
 
 
-def _match_name(wanted: str, known: list[str], where: str) -> str:
+def _match_main_file(wanted: str, known: list[str], where: str) -> str:
     path = wanted.replace("\\", "/").removeprefix("./")
     for fits in (
         [name for name in known if name == path],
@@ -227,7 +234,7 @@ def _match_name(wanted: str, known: list[str], where: str) -> str:
 
 def _outermost_files(files: Mapping[str, bytes], found: list[str]) -> list[str]:
     """Return the files to which no other one refers by name."""
-    texts = {name: text_of(files[name]).lower() for name in found}
+    texts = {name: decode_text(files[name]).lower() for name in found}
 
     def is_included(name: str) -> bool:
         return any(PurePosixPath(name).name.lower() in text for other, text in texts.items() if other != name)
@@ -235,7 +242,7 @@ def _outermost_files(files: Mapping[str, bytes], found: list[str]) -> list[str]:
     return [name for name in found if not is_included(name)]
 
 
-def _leaves(names: list[str]) -> str:
+def _shortest_name(names: list[str]) -> str:
     leaves = [PurePosixPath(name).name for name in names]
     return leaves[0] if leaves.count(leaves[0]) == 1 else names[0]
 
@@ -248,7 +255,7 @@ def hand_name(leaf: str) -> str:
     return path.name
 
 
-def _description_head(files: Mapping[str, bytes], name: str) -> bytes:
+def _read_description_head(files: Mapping[str, bytes], name: str) -> bytes:
     if PurePosixPath(name).suffix.lower() not in SUFFIXES:
         return b""
     if isinstance(files, ZipFiles) and files.size(name) > 1 << 23:

@@ -55,7 +55,7 @@ def missing_error(key: str) -> DamagedShard:
 
 
 @dataclass(frozen=True)
-class _Intact:
+class _PassedCheck:
     """Successful check of an object: valid while `stamp` is unchanged, `until` a monotonic time [s]."""
 
     stamp: Stamp
@@ -69,21 +69,21 @@ class CheckedObjects:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._known: OrderedDict[tuple[str, str], _Intact] = OrderedDict()
+        self._known: OrderedDict[tuple[str, str], _PassedCheck] = OrderedDict()
         self._lock = threading.Lock()
 
     def check(self, key: str, sha256: str) -> None:
         """Verify a stored object, unless a recent check exists; DamagedShard if missing or damaged."""
-        self._intact(key, sha256)
+        self._cached_check(key, sha256)
 
     def stream(self, key: str, sha256: str, start: int, length: int) -> Iterator[bytes]:
         """Yield bytes of a stored object after a new check of each block; may raise DamagedShard."""
-        known = self._intact(key, sha256)
+        known = self._cached_check(key, sha256)
         end = min(known.size, start + length)
-        chunks = self._blocks(key, sha256, known, start, end)
+        chunks = self._checked_blocks(key, sha256, known, start, end)
         return chain([first], chunks) if (first := next(chunks, None)) is not None else chunks
 
-    def _blocks(self, key: str, sha256: str, known: _Intact, start: int, end: int) -> Iterator[bytes]:
+    def _checked_blocks(self, key: str, sha256: str, known: _PassedCheck, start: int, end: int) -> Iterator[bytes]:
         for number in range(start // STREAM_BYTES, -(-end // STREAM_BYTES)):
             at = number * STREAM_BYTES
             block = self._store.get_range(key, at, min(STREAM_BYTES, known.size - at))
@@ -93,7 +93,7 @@ class CheckedObjects:
                 raise DamagedShard(f"{key} is damaged: some of its bytes changed since it was read; {FIX}")
             yield block[max(0, start - at) : end - at]
 
-    def _intact(self, key: str, sha256: str) -> _Intact:
+    def _cached_check(self, key: str, sha256: str) -> _PassedCheck:
         try:
             stamp = self._store.stamp(key)
             with self._lock:
@@ -108,7 +108,7 @@ class CheckedObjects:
         except NotFoundError:
             raise missing_error(key) from None
         check_digest(key, digest.hexdigest(), sha256)
-        known = _Intact(stamp, time.monotonic() + _BELIEVED_S, size, tuple(blocks))
+        known = _PassedCheck(stamp, time.monotonic() + _BELIEVED_S, size, tuple(blocks))
         with self._lock:
             self._known[key, sha256] = known
             if len(self._known) > _REMEMBERED:
@@ -152,7 +152,7 @@ def _expected_checksum(path: Path) -> str | None:
     digest = _manifest_checksum(path)
     for sums in (folder / name for folder in list(path.parents)[:_LEVELS] for name in CHECKSUM_LISTS):
         if digest is None and sums.is_file():
-            digest = _hashes(sums, sums.stat().st_mtime_ns).get(str(path.relative_to(sums.parent)))
+            digest = _read_checksum_list(sums, sums.stat().st_mtime_ns).get(str(path.relative_to(sums.parent)))
     return digest
 
 
@@ -167,7 +167,7 @@ def _manifest_checksum(path: Path) -> str | None:
 
 
 @lru_cache(maxsize=8)
-def _hashes(sums: Path, _changed: int) -> dict[str, str]:
+def _read_checksum_list(sums: Path, _changed: int) -> dict[str, str]:
     lines = (line.split(maxsplit=1) for line in sums.read_text(errors="replace").splitlines())
     return {parts[1].removeprefix("*"): parts[0] for parts in lines if len(parts) == 2 and _DIGEST.fullmatch(parts[0])}
 
@@ -207,7 +207,7 @@ def get_document(store: Store, key: str) -> dict[str, Any]:
     except ValueError:
         document = None
     if not isinstance(document, dict):
-        raise _damaged(key)
+        raise _damage_error(key)
     document.pop("checksum", None)
     return document
 
@@ -217,7 +217,7 @@ def add_seal(key: str, data: bytes) -> bytes:
     if key.endswith(".json") and data[:1] == b"{":
         data, at = _JSON + _ZEROS + b'",' + data[1:], len(_JSON)
     elif key.endswith(".glb") and data[:4] == b"glTF" and data[_GLB_AT : _GLB_AT + 1] == b"{":
-        data, at = _with_blank_checksum(data), _GLB_AT + len(_GLB)
+        data, at = _insert_blank_checksum(data), _GLB_AT + len(_GLB)
     elif key.endswith((".zip", ".npz")) and data[-_END.size : 4 - _END.size] == _END_MARK and data[-2:] == b"\0\0":
         comment = _ZIP + _ZEROS
         data = data[:-2] + struct.pack("<H", len(comment)) + comment
@@ -249,7 +249,7 @@ def is_sealed(key: str, chunks: Iterable[bytes], size: int) -> bool:
         if len(head) < longest:
             head = (head + chunk)[:longest]
         tail = (tail + chunk)[-_END.size - len(_ZIP) - len(_ZEROS) :]
-        digest.update(_without_digits(chunk, at - read))
+        digest.update(_blank_seal_digits(chunk, at - read))
         read += len(chunk)
     if is_zip:
         found, is_whole = tail[-len(_ZEROS) :], tail[-len(_ZEROS) - len(_ZIP) : -len(_ZEROS)] == _ZIP
@@ -261,20 +261,20 @@ def is_sealed(key: str, chunks: Iterable[bytes], size: int) -> bool:
         return True
     if has_none:
         return False
-    raise _damaged(key)
+    raise _damage_error(key)
 
 
-def _damaged(key: str) -> DamagedError:
+def _damage_error(key: str) -> DamagedError:
     problem = f"{key} in the store is damaged: its bytes do not match its checksum"
     return DamagedError(f"{problem}; put a copy in its place, or run `graspd admin store verify --repair`")
 
 
-def _without_digits(chunk: bytes, at: int) -> bytes:
+def _blank_seal_digits(chunk: bytes, at: int) -> bytes:
     first, last = max(0, at), min(len(chunk), at + len(_ZEROS))
     return chunk if first >= last else chunk[:first] + _ZEROS[: last - first] + chunk[last:]
 
 
-def _with_blank_checksum(data: bytes) -> bytes:
+def _insert_blank_checksum(data: bytes) -> bytes:
     length = int.from_bytes(data[12:16], "little")
     document = _GLB + _ZEROS + b'"},' + data[_GLB_AT + 1 : _GLB_AT + length]
     document += b" " * (-len(document) % 4)

@@ -16,12 +16,12 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import JobRequest, count_batches
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.metric_fields import insert_fields, value_fields
-from graspd.service.model.metrics import axis_word, indexed_metrics
+from graspd.service.model.metrics import indexed_metrics, perturbed_parameter_name
 from graspd.service.model.records import Record
 from graspd.service.model.states import Stage
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from graspd.service.store import validity
-from graspd.service.store.columns import SCHEMAS, ShardKind, schema_of
+from graspd.service.store.columns import SCHEMAS, ShardKind, schema_name
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.records import put_record, read_record
 from graspd.service.store.shards import Shard, read_shard
@@ -104,7 +104,7 @@ class ShardManifest(Record):
         return self.counts.get({"base": "N", "scene": scenes, "views": "V"}[self.kind], 0)
 
 
-def manifest_of(
+def create_manifest(
     message: TaskMessage,
     data: bytes,
     arrays: Mapping[str, NDArray[Any]],
@@ -133,30 +133,30 @@ def manifest_of(
         batches=count_batches(message.count),
         code_version=PACKAGE_VERSION,
         stage_revision=STAGE_REVISIONS[message.stage],
-        shard_schema=schema_of(kind),
+        shard_schema=schema_name(kind),
         created=str(attributes.get("created") or timestamp()),
         device=device,
         seconds=round(seconds, 4),
         worker=worker,
         info=dict(info or {}),
         **shared,
-        **_contents(kind, arrays, attributes),
+        **_content_fields(kind, arrays, attributes),
     )
 
 
-def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> dict[str, Any]:
+def _content_fields(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> dict[str, Any]:
     valid = validity.valid_mask(arrays) if kind == "base" else arrays.get("grasp/valid")
     fields: dict[str, Any] = {"valid": 0 if valid is None else int(np.count_nonzero(valid))}
     if kind == "base":
         recheck = arrays.get("quality/recheck", np.empty(0, np.int8))
-        fields["index_threshold_m"], fields["grasps"] = _summaries(arrays, attributes)
+        fields["index_threshold_m"], fields["grasps"] = _grasp_summaries(arrays, attributes)
         fields["candidates"] = int(attributes.get("candidates", len(arrays["quality/valid"])))
         fields["rechecked"] = int(np.count_nonzero(recheck >= 0))
         fields["recheck_held"] = int(np.count_nonzero(recheck == 1))
     return fields
 
 
-def _summaries(
+def _grasp_summaries(
     arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
 ) -> tuple[float, tuple[GraspSummary, ...]]:
     """Return the contact threshold nearest to `INDEX_THRESHOLD_M` [m], and the quality of grasps at it."""
@@ -170,10 +170,12 @@ def _summaries(
     }
     columns["valid"] = validity.valid_mask(arrays).tolist()
     for name in ("success", "lift_hard"):
-        columns[name] = [_verdict(int(v)) for v in arrays.get(f"quality/{name}", np.full(count, -1))]
+        columns[name] = [_decode_verdict(int(v)) for v in arrays.get(f"quality/{name}", np.full(count, -1))]
     level = attributes.get("verdict_level")
     columns["verdict_level"] = [None if verdict is None else level for verdict in columns["success"]]
-    columns["robust_weakest"] = [axis_word(int(v)) for v in arrays.get("quality/robust_weakest", np.zeros(count))]
+    columns["robust_weakest"] = [
+        perturbed_parameter_name(int(v)) for v in arrays.get("quality/robust_weakest", np.zeros(count))
+    ]
     rows = zip(*columns.values(), strict=True)
     return float(thresholds[at]), tuple(GraspSummary(**dict(zip(columns, row, strict=True))) for row in rows)
 
@@ -204,8 +206,10 @@ def rebuild_manifest(said: Mapping[str, Any], data: bytes) -> ShardManifest:
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
     shard = read_shard(data, without=pictures, name=said["key"])
     file = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}
-    return ShardManifest.model_validate({**said, **file, **_contents(said["kind"], shard.arrays, shard.attributes)})
+    return ShardManifest.model_validate(
+        {**said, **file, **_content_fields(said["kind"], shard.arrays, shard.attributes)}
+    )
 
 
-def _verdict(value: int) -> bool | None:
+def _decode_verdict(value: int) -> bool | None:
     return None if value < 0 else bool(value)

@@ -27,7 +27,7 @@ class Reference:
     """For names with a scheme: tails of the path, longer than the file name, to find below any folder."""
 
 
-def read_reference(written: str, base: str) -> Reference:
+def resolve_mesh_reference(written: str, base: str) -> Reference:
     """Resolve a name with slashes, backslashes, spaces or `%20`; the text of InputError lacks the name.
 
     A ROS package may be packed with or without its folder and parent folders: `package://NAME/a/b.stl` is NAME/a/b.stl,
@@ -40,9 +40,9 @@ def read_reference(written: str, base: str) -> Reference:
         raise InputError("is no file of this hand; put it beside the URDF")
     rest = text[found.end() :] if found else text
     # `..` in a name with a scheme is relative to the package, otherwise to the folder of the description.
-    paths = [_inside(rest, "" if scheme else base)]
+    paths = [_resolve_inside(rest, "" if scheme else base)]
     with suppress(InputError):
-        paths += [_inside(unquote(rest), "" if scheme else base)]
+        paths += [_resolve_inside(unquote(rest), "" if scheme else base)]
     tails = [tail for path in dict.fromkeys(paths) for tail in (_path_suffixes(path) if scheme else [path])]
     names = [str(PurePosixPath(folder) / tail) for tail in tails for folder in (base, "")]
     return Reference(tuple(dict.fromkeys(names)), scheme, tuple(tail for tail in tails if scheme and "/" in tail))
@@ -59,7 +59,7 @@ def _path_suffixes(path: str) -> list[str]:
     return [str(PurePosixPath(*parts[start:])) for start in range(len(parts))]
 
 
-def _inside(path: str, base: str) -> str:
+def _resolve_inside(path: str, base: str) -> str:
     """Resolve `../meshes/x` relative to a folder; InputError if the result is outside the upload."""
     dots = ".." in path and not path.startswith("/")
     try:
@@ -85,15 +85,15 @@ _TAKEN: Final = (".mtl", *_PICTURES)
 def file_references(name: str, data: bytes) -> list[str]:
     """Return at most `MAX_NAMES` names of textures and materials, as written in a mesh or a library."""
     pattern = _NAMED_BY.get(PurePosixPath(name).suffix.lower())
-    return [reference_of(text) for text in pattern.findall(data[:HEAD_BYTES])[:MAX_NAMES]] if pattern else []
+    return [parse_reference(text) for text in pattern.findall(data[:HEAD_BYTES])[:MAX_NAMES]] if pattern else []
 
 
-def reference_of(text: bytes) -> str:
+def parse_reference(text: bytes) -> str:
     words = text.decode(errors="replace").strip()
     return words.split()[-1] if words.startswith("-") else words
 
 
-def resolve(name: str, reference: str, there: Callable[[str], bool]) -> str | None:
+def resolve_appearance_file(name: str, reference: str, there: Callable[[str], bool]) -> str | None:
     """Resolve a reference of mesh `name` by path, or by name in its folder; None if no file is `there`."""
     folder, path = posixpath.dirname(name), reference.replace("\\", "/")
     path = path.partition("://")[2] or path
@@ -108,7 +108,7 @@ def appearance_files(name: str, files: Mapping[str, bytes]) -> list[str]:
     """Return the names of the files that define the appearance of a mesh: libraries, then pictures."""
     found: list[str] = []
     for reference in file_references(name, files[name]):
-        one = resolve(name, reference, files.__contains__)
+        one = resolve_appearance_file(name, reference, files.__contains__)
         if one and one not in found:
             found.append(one)
             if one.lower().endswith(".mtl"):

@@ -24,7 +24,7 @@ from graspd.service.model.base import Digest, Name, first_error
 from graspd.service.model.digests import digest_bytes
 from graspd.service.model.errors import InputError, LimitError
 from graspd.service.store.assets import asset_json
-from graspd.service.store.descriptions import json_object, parse_description
+from graspd.service.store.descriptions import parse_description, parse_json_object
 
 SCHEMA: Final = "graspd/proposals@1"
 #: Size limit of a file [bytes], packed or unpacked; a network of 22 joints takes 5.4 MB.
@@ -65,8 +65,8 @@ class _Meta(BaseModel):
     def _check_joints(self) -> _Meta:
         if len(set(self.joint_names)) != len(self.joint_names):
             raise ValueError("a joint is named twice")
-        if self.sizes != sizes(len(self.joint_names)):
-            raise ValueError(f"sizes of this schema are {sizes(len(self.joint_names))}")
+        if self.sizes != layer_sizes(len(self.joint_names)):
+            raise ValueError(f"sizes of this schema are {layer_sizes(len(self.joint_names))}")
         return self
 
 
@@ -97,7 +97,7 @@ def row_size(joints: int) -> int:
     return POSE + 3 * joints
 
 
-def sizes(joints: int) -> dict[str, tuple[int, ...]]:
+def layer_sizes(joints: int) -> dict[str, tuple[int, ...]]:
     return {
         "encoder": (*ENCODER, FEATURE),
         "condition": (CONDITION,),
@@ -122,12 +122,12 @@ def to_bytes(network: ProposalNetwork) -> bytes:
     """Serialise a network; InputError if `from_bytes` would reject it."""
     joints = len(network.joint_names)
     try:
-        meta = _Meta(schema=SCHEMA, sizes=sizes(joints), **{name: getattr(network, name) for name in _SHARED})
+        meta = _Meta(schema=SCHEMA, sizes=layer_sizes(joints), **{name: getattr(network, name) for name in _SHARED})
     except ValidationError as error:
         raise InputError(f"the network cannot be written: {first_error(error)}") from None
     found = {"mean": network.mean, "std": network.std, **network.weights}
     arrays = {name: np.asarray(array, np.float32) for name, array in found.items()}
-    _check(arrays, joints, "the network cannot be written")
+    _check_arrays(arrays, joints, "the network cannot be written")
     buffer = io.BytesIO()
     members: dict[str, Any] = {_META: np.array(meta.model_dump_json(by_alias=True)), **arrays}
     np.savez(buffer, **members)
@@ -152,14 +152,14 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             meta = _read_meta(archive, what)
             joints = len(meta.joint_names)
-            expected = _expected(joints)
+            expected = _expected_shapes(joints)
             found = sorted(info.filename for info in archive.infolist())
             if found != sorted(f"{name}.npy" for name in [_META, *expected]):
-                raise InputError(f"{what}: its arrays differ from {SCHEMA}: {_difference(found, expected)}")
-            arrays = {name: _read(archive, name, shape, what) for name, shape in expected.items()}
+                raise InputError(f"{what}: its arrays differ from {SCHEMA}: {_difference_text(found, expected)}")
+            arrays = {name: _read_array(archive, name, shape, what) for name, shape in expected.items()}
     except _BROKEN as error:
         raise InputError(f"{what} is no .npz file of {SCHEMA}: {error}") from None
-    _check(arrays, joints, what)
+    _check_arrays(arrays, joints, what)
     for array in arrays.values():
         array.flags.writeable = False
     mean, std = arrays.pop("mean"), arrays.pop("std")
@@ -171,39 +171,39 @@ def check_size(size: int, what: str) -> None:
         raise LimitError(f"{what} has more than {MAX_BYTES >> 20} MiB; a proposal network is smaller")
 
 
-def _expected(joints: int) -> dict[str, tuple[int, ...]]:
+def _expected_shapes(joints: int) -> dict[str, tuple[int, ...]]:
     return {"mean": (row_size(joints),), "std": (row_size(joints),), **weight_shapes(joints)}
 
 
 def _read_meta(archive: zipfile.ZipFile, what: str) -> _Meta:
-    data = _member(archive, _META, _MOST_META + _HEADER)
-    shape, dtype = _header(data)
+    data = _read_member(archive, _META, _MOST_META + _HEADER)
+    shape, dtype = _read_header(data)
     if shape != () or dtype.kind != "U":
         raise InputError(f"{what}: {_META} must be one text")
     text = str(npy.read_array(io.BytesIO(data), allow_pickle=False)[()])
     try:
-        return _Meta.model_validate(json_object(text, f"{what}: {_META}"))
+        return _Meta.model_validate(parse_json_object(text, f"{what}: {_META}"))
     except ValidationError as error:
         raise InputError(f"{what}: {_META}: {first_error(error)}") from None
 
 
-def _read(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], what: str) -> Floats32:
+def _read_array(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], what: str) -> Floats32:
     """Read an array whose header matches the schema."""
-    data = _member(archive, name, 4 * int(np.prod(shape)) + _HEADER)
-    found, dtype = _header(data)
+    data = _read_member(archive, name, 4 * int(np.prod(shape)) + _HEADER)
+    found, dtype = _read_header(data)
     if found != shape or dtype != np.dtype("<f4"):
         raise InputError(f"{what}: {name} is {dtype.name} {found}; {SCHEMA} has float32 {shape}")
     return np.asarray(npy.read_array(io.BytesIO(data), allow_pickle=False), np.float32)
 
 
-def _member(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
+def _read_member(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
     member = archive.getinfo(f"{name}.npy")
     if member.file_size > limit:
         raise ValueError(f"{name} unpacks to {member.file_size} bytes")
     return archive.read(member)
 
 
-def _header(data: bytes) -> tuple[tuple[int, ...], np.dtype[Any]]:
+def _read_header(data: bytes) -> tuple[tuple[int, ...], np.dtype[Any]]:
     file = io.BytesIO(data)
     version = npy.read_magic(file)
     if version not in ((1, 0), (2, 0)):
@@ -212,10 +212,10 @@ def _header(data: bytes) -> tuple[tuple[int, ...], np.dtype[Any]]:
     return shape, dtype
 
 
-def _check(arrays: Mapping[str, Floats32], joints: int, what: str) -> None:
-    expected = _expected(joints)
+def _check_arrays(arrays: Mapping[str, Floats32], joints: int, what: str) -> None:
+    expected = _expected_shapes(joints)
     if set(arrays) != set(expected):
-        raise InputError(f"{what}: {_difference([f'{name}.npy' for name in arrays], expected)}")
+        raise InputError(f"{what}: {_difference_text([f'{name}.npy' for name in arrays], expected)}")
     for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise InputError(f"{what}: {name} has shape {arrays[name].shape}; {joints} joints need {shape}")
@@ -225,7 +225,7 @@ def _check(arrays: Mapping[str, Floats32], joints: int, what: str) -> None:
         raise InputError(f"{what}: std must be positive")
 
 
-def _difference(found: list[str], expected: Mapping[str, object]) -> str:
+def _difference_text(found: list[str], expected: Mapping[str, object]) -> str:
     wanted = {f"{name}.npy" for name in [_META, *expected]}
     missing, foreign = sorted(wanted - {*found, f"{_META}.npy"}), sorted(set(found) - wanted)
     parts = [f"{word} {', '.join(names[:4])}" for word, names in (("without", missing), ("besides", foreign)) if names]

@@ -10,7 +10,7 @@ from typing import Final
 
 from graspd.service.cli import load_settings
 from graspd.service.model.errors import InputError, LimitError
-from graspd.service.model.names import shorten
+from graspd.service.model.names import shorten_name
 from graspd.service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
 
 SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb")
@@ -22,7 +22,7 @@ _INNER: Final = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "
 Objects = dict[str, dict[str, bytes]]
 
 
-def files_of_set(path: Path) -> Objects | None:
+def find_set_objects(path: Path) -> Objects | None:
     """Find names and files of objects in a folder or ZIP; None if the path is a single object."""
     if not path.is_dir() and not (path.suffix.lower() == ".zip" and path.is_file()):
         return None
@@ -30,27 +30,27 @@ def files_of_set(path: Path) -> Objects | None:
     # With `asset.json` at its top, a ZIP is one object with any number of meshes.
     if path.is_file() and "asset.json" in files:
         return None
-    found = object_set(files)
+    found = group_objects(files)
     return found if path.is_dir() or len(found) > 1 else None
 
 
-def object_set(files: Mapping[str, bytes]) -> Objects:
+def group_objects(files: Mapping[str, bytes]) -> Objects:
     """Group the files of a set by object: sorted names, each with its mesh and `asset.json`, if any."""
     meshes = sorted(name for name in files if PurePosixPath(name).suffix.lower() in SUFFIXES)
     if not meshes:
         raise InputError(f"no mesh among {len(files)} files; a set holds {', '.join(SUFFIXES)}")
     owners: dict[tuple[str, ...], list[str]] = {}
     for mesh in meshes:
-        owners.setdefault(_owner(mesh), []).append(mesh)
+        owners.setdefault(_object_folder(mesh), []).append(mesh)
     top = _common_folders(owners)
     chosen: dict[str, str] = {}
     for owner, names in owners.items():
         # EGAD: each mesh of one folder is an object. YCB: each object has a folder with variants of its mesh.
         is_object = len(owner) > len(top) and _are_variants(names)
-        for name in [min(names, key=_rank)] if is_object else names:
+        for name in [min(names, key=_preference_key)] if is_object else names:
             parts = owner[len(top) :] if is_object else (*owner[len(top) :], PurePosixPath(name).stem)
-            chosen[_name("_".join(parts), chosen)] = name
-    return {name: _files_of(files, mesh) for name, mesh in sorted(chosen.items())}
+            chosen[_unique_name("_".join(parts), chosen)] = name
+    return {name: _object_files(files, mesh) for name, mesh in sorted(chosen.items())}
 
 
 def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
@@ -69,7 +69,7 @@ def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
     return files
 
 
-def _owner(mesh: str) -> tuple[str, ...]:
+def _object_folder(mesh: str) -> tuple[str, ...]:
     parts = PurePosixPath(mesh).parts[:-1]
     while len(parts) > 1 and parts[-1].lower() in _INNER:
         parts = parts[:-1]
@@ -90,20 +90,20 @@ def _are_variants(names: list[str]) -> bool:
     return len(stems) == 1 or any(stem in PREFERRED for stem in stems)
 
 
-def _rank(name: str) -> tuple[int, str]:
+def _preference_key(name: str) -> tuple[int, str]:
     stem = PurePosixPath(name).stem.lower()
     return (PREFERRED.index(stem) if stem in PREFERRED else len(PREFERRED), name)
 
 
-def _name(text: str, taken: Mapping[str, str]) -> str:
-    name = shorten(re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object", 60)
+def _unique_name(text: str, taken: Mapping[str, str]) -> str:
+    name = shorten_name(re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object", 60)
     number = 2
     while name in taken:
         name, number = f"{name[:57]}-{number}", number + 1
     return name
 
 
-def _files_of(files: Mapping[str, bytes], mesh: str) -> dict[str, bytes]:
+def _object_files(files: Mapping[str, bytes], mesh: str) -> dict[str, bytes]:
     path = PurePosixPath(mesh)
     paths = {path.name: mesh, "asset.json": str(path.parent / "asset.json")}
     return {name: files[file] for name, file in paths.items() if file in files}

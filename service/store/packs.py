@@ -32,7 +32,7 @@ _MAGIC: Final = b"graspd\x00\x01"
 _HEAD: Final = struct.Struct("<8sQ")
 
 
-class _Packed(Record):
+class _PackEntry(Record):
     """Positions of a shard's file and manifest after the directory [bytes], with checksums."""
 
     id: Digest
@@ -49,7 +49,7 @@ def has_packs(store: Store) -> bool:
     return next(iter(store.list(_FOLDER)), None) is not None
 
 
-def unpack_all(store: Store) -> Iterator[ShardManifest]:
+def convert_packs(store: Store) -> Iterator[ShardManifest]:
     """Replace each pack by a file and a manifest per shard; yield the manifests.
 
     An interrupted call can be repeated. Damaged packs move to `damaged/`. The manifest of a damaged file is stored,
@@ -59,16 +59,16 @@ def unpack_all(store: Store) -> Iterator[ShardManifest]:
     packs = [key for key in keys if key.endswith(".pack")]
     for pack in packs:
         dead = pack.removesuffix(".pack") + ".dead/"
-        yield from _unpack(store, pack, [key for key in keys if key.startswith(dead)])
+        yield from _convert_pack(store, pack, [key for key in keys if key.startswith(dead)])
     for key in set(keys) - set(packs):
         store.delete(key)
 
 
-def _unpack(store: Store, key: str, dead: list[str]) -> Iterator[ShardManifest]:
+def _convert_pack(store: Store, key: str, dead: list[str]) -> Iterator[ShardManifest]:
     try:
         data = store.get(key)
         gone = {shard for record in dead for shard in json.loads(store.get(record))["shards"]}
-        body, shards = _directory(key, data)
+        body, shards = _read_directory(key, data)
     except NotFoundError:
         return  # Another process converted the pack.
     except (DamagedError, ValueError, LookupError, TypeError) as error:
@@ -77,8 +77,8 @@ def _unpack(store: Store, key: str, dead: list[str]) -> Iterator[ShardManifest]:
         return
     whole = True
     for shard in (shard for shard in shards if shard.id not in gone):
-        manifest = _piece(data, body + shard.manifest_start, shard.manifest_length, shard.manifest_sha256)
-        file = _piece(data, body + shard.start, shard.length, shard.sha256)
+        manifest = _checked_piece(data, body + shard.manifest_start, shard.manifest_length, shard.manifest_sha256)
+        file = _checked_piece(data, body + shard.start, shard.length, shard.sha256)
         whole = whole and manifest is not None and file is not None
         if manifest is None:
             continue
@@ -96,18 +96,18 @@ def _unpack(store: Store, key: str, dead: list[str]) -> Iterator[ShardManifest]:
         store.set_aside(key)
 
 
-def _directory(key: str, data: bytes) -> tuple[int, list[_Packed]]:
+def _read_directory(key: str, data: bytes) -> tuple[int, list[_PackEntry]]:
     head, rest = data[: _HEAD.size], data[_HEAD.size :]
     magic, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (b"", 0)
     directory = rest[:length]
     if magic != _MAGIC or digest_bytes(directory) != key.rpartition("/")[2].removesuffix(".pack"):
         raise DamagedError("its directory does not match its name")
     try:
-        return _HEAD.size + length, [_Packed.model_validate(one) for one in json.loads(directory)["shards"]]
+        return _HEAD.size + length, [_PackEntry.model_validate(one) for one in json.loads(directory)["shards"]]
     except ValidationError as error:
         raise DamagedError(str(error)) from None
 
 
-def _piece(data: bytes, start: int, length: int, sha256: str) -> bytes | None:
+def _checked_piece(data: bytes, start: int, length: int, sha256: str) -> bytes | None:
     piece = data[start : start + length]
     return piece if hashlib.sha256(piece).hexdigest() == sha256 else None

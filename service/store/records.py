@@ -129,18 +129,18 @@ def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Sn
     return max(snapshots, key=lambda snapshot: (snapshot.created, snapshot.digest))
 
 
-def newest_version(store: Store, tag: str) -> Tag | None:
+def newest_tag_version(store: Store, tag: str) -> Tag | None:
     keys = _keys(store, names.tag_versions_folder(tag))
     return read_record(Tag, store, keys[-1]) if keys else None
 
 
-def put_version(put: Put, tag: Tag) -> None:
+def put_tag_version(put: Put, tag: Tag) -> None:
     """Write the next version of a tag; ConflictError if another change was written first."""
     if not put(names.tag_version_key(tag.id, tag.number), tag):
         raise ConflictError(f"the tag {tag.name!r} was changed a moment ago; try again")
 
 
-def drop_older_versions(store: Store, tag: Tag) -> None:
+def delete_older_tag_versions(store: Store, tag: Tag) -> None:
     """Remove outdated versions of a tag; for a deleted tag then also the last version."""
     last = names.tag_version_key(tag.id, tag.number)
     for key in _keys(store, names.tag_versions_folder(tag.id)):
@@ -197,11 +197,11 @@ def publish_record(store: Store, kind: str, record: Mapping[str, Any]) -> str:
 
 def latest_record(store: Store, kind: str) -> dict[str, Any] | None:
     """Load the newest record of a kind, with present names; None if there is none."""
-    key = latest_key(store, kind)
+    key = latest_record_key(store, kind)
     return convert_chart(get_document(store, key)) if key else None
 
 
-def latest_key(store: Store, kind: str) -> str:
+def latest_record_key(store: Store, kind: str) -> str:
     return max((key for key in _keys(store, kind) if key.endswith(".json")), default="")
 
 
@@ -247,12 +247,12 @@ def removed_folder(deletion: Deletion) -> str:
     return f"{names.REMOVED}/{_DIGITS.sub('', deletion.at)}-{deletion.what}-{deletion.id}"
 
 
-def removed_before(key: str, at: str) -> bool:
+def is_removed_before(key: str, at: str) -> bool:
     """Check whether a key below `removed/` belongs to a deletion before the time `at`."""
     return key.split("/")[1].partition("-")[0] < _DIGITS.sub("", at)
 
 
-def deletions(store: Store, what: str = "") -> list[Deletion]:
+def restorable_deletions(store: Store, what: str = "") -> list[Deletion]:
     """Return the deletions that can be undone, newest first, of one kind of resource or of all."""
     found: dict[str, Deletion] = {}
     # The controller copies a deletion to the second folder, and then removes it from the first folder.

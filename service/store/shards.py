@@ -21,7 +21,7 @@ from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
 from graspd.service.model.renamed import COLUMNS, convert_names
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.service.store.columns import SCHEMAS, Attribute, ShardKind, check_attributes, schema_of
+from graspd.service.store.columns import SCHEMAS, Attribute, ShardKind, check_attributes, schema_name
 from graspd.service.store.integrity import check_file
 
 Arrays = Mapping[str, NDArray[np.generic]]
@@ -49,7 +49,7 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="v110") as file:
         # Each attribute is written only once, because HDF5 files keep overwritten text.
-        own = {"schema": schema_of(kind), "code_version": PACKAGE_VERSION, "created": timestamp()}
+        own = {"schema": schema_name(kind), "code_version": PACKAGE_VERSION, "created": timestamp()}
         for name, value in {**own, **attributes}.items():
             file.attrs[name] = value
         for path, array in arrays.items():
@@ -67,7 +67,7 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
             dataset = file.create_dataset(path, data=data, track_times=False, **options)
             for name in ("units", "frame", "description"):
                 dataset.attrs[name] = getattr(column, name)
-            dataset.attrs[_DIGEST] = _digest(data)
+            dataset.attrs[_DIGEST] = _array_digest(data)
             if path.endswith("joint_positions") and "joint_names" in attributes:
                 dataset.attrs["joint_names"] = attributes["joint_names"]
     return buffer.getvalue()
@@ -109,11 +109,11 @@ def read_shard(
     """Read a shard, but not the datasets `without`; InputError for another kind, DamagedShard for damage."""
     name = name or ("shard" if isinstance(source, bytes) else str(source))
     with open_shard(source, name=name) as file:
-        found = kind_of(file, name)
+        found = shard_kind(file, name)
         if kind is not None and found != kind:
             raise InputError(f"{name} is a {found} shard; a {kind} shard is needed here")
         arrays = {p: read_column(file, p, name) for p in SCHEMAS[found] if p in file and p not in without}
-        attributes = {k: _attribute(v) for k, v in file.attrs.items()}
+        attributes = {k: _decode_attribute(v) for k, v in file.attrs.items()}
     return Shard(found, attributes, arrays, None if isinstance(source, bytes) else source)
 
 
@@ -179,7 +179,7 @@ def _check_contents(file: h5py.File, name: str) -> None:
         raise InputError(f"{name} claims {claimed} bytes, {claimed // held} times its content, too much for a shard")
 
 
-def kind_of(file: h5py.File, name: str) -> ShardKind:
+def shard_kind(file: h5py.File, name: str) -> ShardKind:
     schema = str(file.attrs.get("schema", ""))
     found = schema.removeprefix("graspd/").partition("@")[0]
     if not schema.startswith("graspd/") or found not in SCHEMAS:
@@ -190,16 +190,16 @@ def kind_of(file: h5py.File, name: str) -> ShardKind:
 def read_column(file: h5py.File, path: str, name: str) -> NDArray[Any]:
     dataset = file[path]
     data = np.asarray(dataset)
-    if (expected := dataset.attrs.get(_DIGEST)) is not None and _digest(data) != expected:
+    if (expected := dataset.attrs.get(_DIGEST)) is not None and _array_digest(data) != expected:
         raise DamagedShard(f"{name} is damaged: the values of {path} changed since they were written")
     return data
 
 
-def _digest(data: NDArray[Any]) -> str:
+def _array_digest(data: NDArray[Any]) -> str:
     return hashlib.sha256(np.ascontiguousarray(data).data).hexdigest()
 
 
-def _attribute(value: object) -> Attribute:
+def _decode_attribute(value: object) -> Attribute:
     if isinstance(value, np.ndarray):
         return [*map(str, value)]
     if isinstance(value, np.generic):
@@ -211,15 +211,15 @@ def json_attribute(value: object) -> str:
     return json.dumps(value, sort_keys=True)
 
 
-def carried_attributes(shard: Shard) -> dict[str, Attribute]:
+def inherited_attributes(shard: Shard) -> dict[str, Attribute]:
     return {name: value for name, value in shard.attributes.items() if name != "schema"}
 
 
-def part_of_shard(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
+def shard_bytes_of_rows(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
     """Return the bytes of a base shard with the rows in a mask (N,); values and scenes are unchanged."""
     axes = {path: column.shape.split()[0] for path, column in SCHEMAS["base"].items()}
     arrays = {path: array[mask] if axes[path] == "N" else array for path, array in shard.arrays.items()}
-    attributes = carried_attributes(shard)
+    attributes = inherited_attributes(shard)
     if "shard_id" in attributes:
         attributes["shard_id"] = digest_json([attributes["shard_id"], np.flatnonzero(mask).tolist()])
     return write_shard("base", arrays, attributes)

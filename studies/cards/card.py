@@ -38,31 +38,31 @@ def write_card(
     """Read all shards and write the card over an earlier one; return the content of `card.json`.
     `progress` is called after each shard with the numbers of shards read and of all shards. Raises InputError: the
     folder cannot be created, or the dataset is empty or damaged; StoreUnavailable: the store does not answer."""
-    if not contents.shards.of("base"):
+    if not contents.shards.of_kind("base"):
         raise InputError(f"{contents.name} has no base shard, so its card would be empty")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"the folder {folder} cannot be created: {error.strerror}") from None
 
-    def counted() -> Iterator[ShardContents]:
+    def report_progress() -> Iterator[ShardContents]:
         for number, piece in enumerate(read_shards(contents), start=1):
             yield piece
             progress(number, len(contents.shards))
 
-    tally = tally_of(contents, counted())
+    tally = tally_of(contents, report_progress())
     card = card_content(contents, tally, licence=licence, source=source)
     plots = draw(card, tally, folder)
     if write_samples(contents.shards, folder / SHEET):
         plots[SHEET] = "Some of the pictures"
     card["plots"] = list(plots)
-    (folder / "checksums.sha256").write_text("".join(checksums(contents)))
+    (folder / "checksums.sha256").write_text("".join(checksum_lines(contents)))
     (folder / "card.json").write_text(json.dumps(card, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
     (folder / "README.md").write_text(render_card(card, plots))
     return card
 
 
-def checksums(contents: Contents) -> Iterator[str]:
+def checksum_lines(contents: Contents) -> Iterator[str]:
     """Yield lines for `sha256sum -c` in the folder of the export or of the shards."""
     if contents.snapshot is not None:
         yield from (f"{shard.sha256}  {path_of(shard)}\n" for shard in contents.snapshot.shards)
@@ -76,7 +76,7 @@ def checksums(contents: Contents) -> Iterator[str]:
 
 def write_samples(shards: Shards, file: Path) -> bool:
     """Write a JPEG of sample pictures; return False for a dataset without pictures."""
-    chosen = choose_shards(shards.of("views"))
+    chosen = choose_shards(shards.of_kind("views"))
     if not chosen:
         return False
     pictures = [Image.fromarray(_picture(shards.path(one))) for one in chosen]

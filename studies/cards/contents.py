@@ -19,7 +19,7 @@ from graspd.service.model import names
 from graspd.service.model.errors import InputError, NotFoundError
 from graspd.service.model.metrics import GRASP_METRICS
 from graspd.service.model.planning import plan_tasks
-from graspd.service.model.records import DatasetRecord, Snapshot, job_of
+from graspd.service.model.records import DatasetRecord, Snapshot, create_job_record
 from graspd.service.model.states import AssetKind
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.readers import ShardFile, Shards, open_shards
@@ -70,11 +70,11 @@ def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, c
     return Contents(
         dataset,
         open_shards(store, dataset=dataset, snapshot=taken.digest, cache=cache),
-        {hand.name: _stored(store, AssetKind.HAND, hand.name, hand.digest) for hand in record.hands},
-        {obj.name: _stored(store, AssetKind.OBJECT, obj.name, obj.digest) for obj in record.objects},
+        {hand.name: _stored_asset(store, AssetKind.HAND, hand.name, hand.digest) for hand in record.hands},
+        {obj.name: _stored_asset(store, AssetKind.OBJECT, obj.name, obj.digest) for obj in record.objects},
         taken,
         record,
-        _gaps(store, record, taken),
+        _missing_cells(store, record, taken),
     )
 
 
@@ -85,14 +85,14 @@ def contents_of_folder(folder: Path) -> Contents:
     listed = folder / "snapshot.json"
     taken = parse_record(Snapshot, listed.read_bytes(), str(listed)) if listed.is_file() else None
     hands, objects = (
-        {known: _builtin(kind, known, digest) for known, digest in sorted(_digests(shards, kind).items())}
+        {known: _builtin_asset(kind, known, digest) for known, digest in sorted(_digests(shards, kind).items())}
         for kind in (AssetKind.HAND, AssetKind.OBJECT)
     )
     name = taken.dataset if taken else folder.resolve().name
     return Contents(name, shards, hands, objects, taken, root=folder)
 
 
-def with_provenance(contents: Contents, file: Path) -> Contents:
+def add_provenance(contents: Contents, file: Path) -> Contents:
     """Add licences, sources and descriptions of hands and objects from a JSON file.
     Its form is `{"hands": {"shadow": {"licence": "...", "source": "..."}}, "objects": {"*": {...}, "mug": {...}}}`,
     where `*` stands for all other assets. Raises InputError: the JSON is invalid or names unknown assets."""
@@ -122,26 +122,26 @@ def _with_facts(
     return informed
 
 
-def _stored(store: Store, kind: AssetKind, name: str, digest: str) -> AssetFacts:
+def _stored_asset(store: Store, kind: AssetKind, name: str, digest: str) -> AssetFacts:
     try:
         files = load_asset_files(store, kind, digest)
         builtin = load_asset(store, kind, digest).builtin
     except NotFoundError:
         return AssetFacts(name, digest)
     check = load_check(store, kind, digest) or {}
-    facts = check.get("facts") or (_checked(kind, name) if builtin else {})
-    return _described(name, digest, files, facts, builtin=builtin)
+    facts = check.get("facts") or (_checked_facts(kind, name) if builtin else {})
+    return _asset_facts(name, digest, files, facts, builtin=builtin)
 
 
-def _builtin(kind: AssetKind, name: str, digest: str) -> AssetFacts:
+def _builtin_asset(kind: AssetKind, name: str, digest: str) -> AssetFacts:
     if name in builtin_names(kind):
         asset, files = builtin_asset(kind, name)
         if asset.digest == digest:
-            return _described(name, digest, files, _checked(kind, name), builtin=True)
+            return _asset_facts(name, digest, files, _checked_facts(kind, name), builtin=True)
     return AssetFacts(name, digest)
 
 
-def _described(name: str, digest: str, files: Mapping[str, bytes], facts: Any, *, builtin: bool) -> AssetFacts:
+def _asset_facts(name: str, digest: str, files: Mapping[str, bytes], facts: Any, *, builtin: bool) -> AssetFacts:
     stated = json.loads(files["asset.json"])
     licence, source = str(stated.get("licence", "")), str(stated.get("source", ""))
     if builtin:
@@ -150,7 +150,7 @@ def _described(name: str, digest: str, files: Mapping[str, bytes], facts: Any, *
 
 
 @lru_cache
-def _checked(kind: AssetKind, name: str) -> dict[str, Any]:
+def _checked_facts(kind: AssetKind, name: str) -> dict[str, Any]:
     files = builtin_files(kind, name)
     if kind is AssetKind.HAND:
         from graspd.worker.hands.check import check_hand
@@ -174,11 +174,11 @@ def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
     return found
 
 
-def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, tuple[int, str]]:
+def _missing_cells(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, tuple[int, str]]:
     there = {shard.id for shard in taken.shards}
     gaps = {}
     for cell in record.cells():
-        tasks = plan_tasks(job_of(cell, record.options, record.revisions))
+        tasks = plan_tasks(create_job_record(cell, record.options, record.revisions))
         if missing := [task for task in tasks if task.output not in there]:
             reasons = (attempts[-1].reason for task in missing if (attempts := task_attempts(store, task.id)))
             gaps[cell.hand.name, cell.object.name] = len(missing), next(reasons, "not made yet, or cancelled")
@@ -235,7 +235,7 @@ def _read_shard_file(contents: Contents, file: ShardFile, size: int | None) -> S
         return unopened
     path = contents.shards.path(file)
     with open_shard(path) as opened:
-        said = {key: _plain(value) for key, value in opened.attrs.items()}
+        said = {key: _json_value(value) for key, value in opened.attrs.items()}
         columns = {name: read_column(opened, name, str(path)) for name in COLUMNS[file.kind] if name in opened}
         rows = len(opened[{"base": "quality/valid", "scene": "grasp/valid", "views": "camera/eye"}[file.kind]])
     found = ShardContents(file, columns, said, size or path.stat().st_size, rows)
@@ -259,7 +259,7 @@ def _unread_shard(file: ShardFile, manifest: ShardManifest) -> ShardContents:
     said: dict[str, Any] = {name: getattr(manifest, name) for name in copied}
     said |= {
         "method": manifest.request.method,
-        "fidelity": json_attribute(manifest.request.knobs.model_dump(mode="json")),
+        "fidelity": json_attribute(manifest.request.resolved_fidelity.model_dump(mode="json")),
         "want": manifest.request.want,
     }
     if file.kind == "base":
@@ -267,7 +267,7 @@ def _unread_shard(file: ShardFile, manifest: ShardManifest) -> ShardContents:
     return ShardContents(file, {}, said, manifest.size_bytes, manifest.count, manifest.info, manifest.stage_revision)
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return [str(entry) for entry in value]
     return value.item() if isinstance(value, np.generic) else value

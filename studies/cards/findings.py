@@ -31,30 +31,43 @@ _UNMIXED: Final = {
 
 def findings(card: Row) -> list[str]:
     """Return the findings of a card's content as sentences in Markdown, with figures."""
-    parts = (_gaps, _yields, _balance, _rechecks, _table, _directions, _joints, _qualities, _mixed, _unknown)
+    parts = (
+        _missing_cell_findings,
+        _yield_findings,
+        _balance_findings,
+        _recheck_findings,
+        _table_findings,
+        _direction_findings,
+        _joint_findings,
+        _quality_findings,
+        _mixed_setting_findings,
+        _licence_findings,
+    )
     return [line for part in parts for line in part(card)]
 
 
-def _gaps(card: Row) -> Iterator[str]:
+def _missing_cell_findings(card: Row) -> Iterator[str]:
     if card["snapshot"] and not card["snapshot"]["complete"]:
         yield "**Not complete**: the snapshot was taken before every cell had succeeded."
     missing = [cell for cell in card["cells"] if cell["missing_tasks"]]
     for cell in missing[:_SHOWN]:
-        yield f"**{_pair(cell)} lacks {cell['missing_tasks']} of its shards**: {cell['missing_because']}."
+        yield f"**{_pair_name(cell)} lacks {cell['missing_tasks']} of its shards**: {cell['missing_because']}."
     if len(missing) > _SHOWN:
         yield f"{len(missing) - _SHOWN} more cells lack shards; `card.json` lists them."
     wanted = (card["making"]["options"] or {}).get("want") == "valid"
     short = [c for c in card["cells"] if wanted and not c["missing_tasks"] and c["valid"] < c["asked"]]
     if short:
         short.sort(key=lambda cell: cell["valid"] / cell["asked"])
-        each = _listed([f"{_pair(c)} ({c['valid']} of {c['asked']} after {c['candidates']} candidates)" for c in short])
+        each = _join_words(
+            [f"{_pair_name(c)} ({c['valid']} of {c['asked']} after {c['candidates']} candidates)" for c in short]
+        )
         yield (
             f"**{len(short)} of {len(card['cells'])} cells ran out of budget** before enough valid grasps were found: "
             f"{each}."
         )
 
 
-def _yields(card: Row) -> Iterator[str]:
+def _yield_findings(card: Row) -> Iterator[str]:
     yields: dict[str, list[float]] = {}
     rows = [cell for cell in card["cells"] if cell["of_validated"] is not None]
     for cell in rows:
@@ -62,14 +75,14 @@ def _yields(card: Row) -> Iterator[str]:
     low = [cell for cell in rows if cell["of_validated"] < _LITTLE * median_high(yields[cell["hand"]])]
     if low:
         low.sort(key=lambda cell: cell["of_validated"])
-        each = _listed([f"{_pair(cell)} ({_percent(cell['of_validated'])})" for cell in low])
+        each = _join_words([f"{_pair_name(cell)} ({_percent(cell['of_validated'])})" for cell in low])
         yield (
             f"**Difficult pairs**, with less than half of the hand's median yield: {each}. Their valid grasps are "
             "biased towards easy ones."
         )
 
 
-def _balance(card: Row) -> Iterator[str]:
+def _balance_findings(card: Row) -> Iterator[str]:
     said = []
     for what in ("hands", "objects"):
         counts = {asset["name"]: asset["valid"] for asset in card["composition"][what]}
@@ -80,7 +93,7 @@ def _balance(card: Row) -> Iterator[str]:
         yield f"**Uneven**: {'; '.join(said)}."
 
 
-def _rechecks(card: Row) -> Iterator[str]:
+def _recheck_findings(card: Row) -> Iterator[str]:
     found, rate = card["validity"], card["validity"]["false_valid"]
     if not rate:
         yield (
@@ -89,17 +102,18 @@ def _rechecks(card: Row) -> Iterator[str]:
         )
     elif found["recheck_dropped"]:
         wrong = [
-            f"{_pair(cell)} ({cell['recheck_dropped']} of {cell['rechecked']})"
+            f"{_pair_name(cell)} ({cell['recheck_dropped']} of {cell['rechecked']})"
             for cell in card["cells"]
             if cell["recheck_dropped"]
         ]
         yield (
             f"**Rechecks overturned {found['recheck_dropped']} of {found['rechecked']:,} verdicts** "
-            f"({_percent(rate['share'])}, 95 % {_percent(rate['low'])} to {_percent(rate['high'])}): {_listed(wrong)}."
+            f"({_percent(rate['share'])}, 95 % {_percent(rate['low'])} to {_percent(rate['high'])}): "
+            f"{_join_words(wrong)}."
         )
 
 
-def _table(card: Row) -> Iterator[str]:
+def _table_findings(card: Row) -> Iterator[str]:
     found = card["table"]
     if not found["grasps"]:
         return
@@ -114,12 +128,12 @@ def _table(card: Row) -> Iterator[str]:
         why = [f"{_percent(count / found['pairs'])} to {what}" for what, count in found["too_near"].items()]
         told += f" Pairs that are too close: {', '.join(why)}."
     if len(rows) > 3:
-        told += f" Fewest clear grasps: {_listed([f'{name} ({_percent(rows[name])})' for name in worst])}."
+        told += f" Fewest clear grasps: {_join_words([f'{name} ({_percent(rows[name])})' for name in worst])}."
     yield told
-    yield from _elevations(card)
+    yield from _elevation_findings(card)
 
 
-def _elevations(card: Row) -> Iterator[str]:
+def _elevation_findings(card: Row) -> Iterator[str]:
     """Compare elevations of palms over the table with directions drawn uniformly on the sphere."""
     every, clear = (
         np.sum([sums[name] for sums in card["elevation"].values()] or [[0]], axis=0) for name in ("all", "clear")
@@ -143,12 +157,12 @@ def _elevations(card: Row) -> Iterator[str]:
         )
 
 
-def _directions(card: Row) -> Iterator[str]:
+def _direction_findings(card: Row) -> Iterator[str]:
     rows = card["directions"]
     some = {name: row for name, row in rows["by_object"].items() if row and row["grasps"] >= rows["enough"]}
     empty = {name: row["empty"] for name, row in some.items() if row["empty"] > _EMPTY * rows["cells"]}
     if empty:
-        each = _listed([f"{name} ({empty[name]})" for name in sorted(empty, key=lambda name: -empty[name])])
+        each = _join_words([f"{name} ({empty[name]})" for name in sorted(empty, key=lambda name: -empty[name])])
         yield f"**Unused directions**, of {rows['cells']} of equal area in the object's frame: {each}."
     elif some:
         most = max(some, key=lambda name: some[name]["empty"])
@@ -160,11 +174,11 @@ def _directions(card: Row) -> Iterator[str]:
         )
 
 
-def _joints(card: Row) -> Iterator[str]:
+def _joint_findings(card: Row) -> Iterator[str]:
     for hand, joints in card["joints"].items():
         still = [f"`{name}` ({_percent(use['used'])})" for name, use in joints.items() if use["used"] < _STILL]
         if still:
-            yield f"**{hand} hardly moves** {_listed(still)} (share of the range that 98 % of the grasps use)."
+            yield f"**{hand} hardly moves** {_join_words(still)} (share of the range that 98 % of the grasps use)."
         ends = [
             f"`{name}` {end} ({_percent(use[f'at_{end}'])})"
             for name, use in joints.items()
@@ -172,10 +186,10 @@ def _joints(card: Row) -> Iterator[str]:
             if use[f"at_{end}"] > _AT_LIMIT and use["used"] >= _STILL
         ]
         if ends:
-            yield f"**{hand} has joints at a limit** in more than half of its grasps: {_listed(ends)}."
+            yield f"**{hand} has joints at a limit** in more than half of its grasps: {_join_words(ends)}."
 
 
-def _qualities(card: Row) -> Iterator[str]:
+def _quality_findings(card: Row) -> Iterator[str]:
     said = []
     for hand, found in card["quality"].items():
         parts = []
@@ -192,7 +206,7 @@ def _qualities(card: Row) -> Iterator[str]:
         yield f"**Valid is not ideal.** {'. '.join(said)}."
 
 
-def _mixed(card: Row) -> Iterator[str]:
+def _mixed_setting_findings(card: Row) -> Iterator[str]:
     if count := card["repeated"]:
         yield f"**{count:,} valid grasps equal another** of their cell to six decimals."
     making = card["making"]
@@ -203,21 +217,21 @@ def _mixed(card: Row) -> Iterator[str]:
         yield f"**Mixed fidelities**: {', '.join(str(knobs.get('name')) for knobs in making['fidelities'])}."
 
 
-def _unknown(card: Row) -> Iterator[str]:
+def _licence_findings(card: Row) -> Iterator[str]:
     for what in ("hands", "objects"):
         nameless = [asset["name"] for asset in card["composition"][what] if not asset["licence"]]
         if nameless:
             yield (
-                f"**Licence not recorded** for {len(nameless)} {what}: {_listed(nameless)}. Ask their authors "
+                f"**Licence not recorded** for {len(nameless)} {what}: {_join_words(nameless)}. Ask their authors "
                 "before you share the dataset."
             )
 
 
-def _pair(cell: Row) -> str:
+def _pair_name(cell: Row) -> str:
     return f"{cell['hand']} on {cell['object']}"
 
 
-def _listed(words: Sequence[str]) -> str:
+def _join_words(words: Sequence[str]) -> str:
     rest = f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else ""
     return ", ".join(words[:_SHOWN]) + rest
 

@@ -17,7 +17,7 @@ from graspd.studies.cards.contents import AssetFacts, Contents
 from graspd.studies.cards.tally import ELEVATION_BINS, ENOUGH, CellTally, Tally, cell_counts
 from graspd.worker.grasps import Posture
 from graspd.worker.quality.diversity import explained_variance
-from graspd.worker.quality.intervals import wilson
+from graspd.worker.quality.intervals import wilson_interval
 
 Row = dict[str, Any]
 #: Codes of `grasp/rejection`: the obstacle, and the phase of the motion.
@@ -33,7 +33,7 @@ _KINDS: Final = ("base", "scene", "views")
 
 def card_content(contents: Contents, tally: Tally, *, licence: str = "", source: str = "") -> Row:
     """Return the whole content of a card as JSON values."""
-    whole = CellTally.of(tally.cells.values())
+    whole = CellTally.merge(tally.cells.values())
     taken = contents.snapshot
     return {
         "schema": "graspd/card@1",
@@ -60,7 +60,7 @@ def card_content(contents: Contents, tally: Tally, *, licence: str = "", source:
             "by_hand": {hand: _directions(tally.of_hand(hand)) for hand in contents.hands},
         },
         "joints": {hand: use.shares() for hand, use in tally.joints.items()},
-        "repeated": sum(_repeated(cell) for cell in tally.cells.values()),
+        "repeated": sum(_duplicate_count(cell) for cell in tally.cells.values()),
         "taxonomy": _taxonomy(whole),
         "cells": _cells(contents, tally),
     }
@@ -70,7 +70,7 @@ def share(part: int, whole: int) -> Row | None:
     """Return a share with its 95 % interval (Wilson 1927); None if `whole` is 0."""
     if not whole:
         return None
-    low, high = wilson(part, whole)
+    low, high = wilson_interval(part, whole)
     return {"share": part / whole, "low": low, "high": high}
 
 
@@ -99,10 +99,10 @@ def _asset(asset: AssetFacts, cell: CellTally, kind: AssetKind) -> Row:
 def _provenance(contents: Contents, tally: Tally, whole: CellTally) -> Row:
     valid = whole.n["valid"]
     total = sum(tally.seconds.values())
-    scenes = [_parse_scene(text) for text in _distinct_values(tally, "scene")]
+    scenes = [_parse_json(text) for text in _distinct_values(tally, "scene")]
     return {
         "methods": _distinct_values(tally, "method"),
-        "fidelities": [_parse_scene(text) for text in _distinct_values(tally, "fidelity")],
+        "fidelities": [_parse_json(text) for text in _distinct_values(tally, "fidelity")],
         "levels": _distinct_values(tally, "verdict_level"),
         "verdict_keys": len(tally.values.get("verdict_key", {})),
         "scenes": sorted({str(spec.get("kind", "")) for spec in scenes} - {"", "free"}),
@@ -129,7 +129,7 @@ def _distinct_values(tally: Tally, name: str) -> list[Any]:
     return sorted(tally.values.get(name, {}))
 
 
-def _parse_scene(text: str) -> Any:
+def _parse_json(text: str) -> Any:
     try:
         return from_json(text)
     except ValueError:
@@ -160,10 +160,10 @@ def _quality(cell: CellTally) -> dict[str, Row]:
         if len(values) and not metric.code:
             found[metric.name] = {
                 "n": len(values),
-                "mean": _six(values.mean()),
-                **{key: _six(np.percentile(values, at)) for key, at in _PERCENTILES.items()},
-                "max": _six(values.max()),
-                "zero": _six(np.mean(values == 0)),
+                "mean": _six_digits(values.mean()),
+                **{key: _six_digits(np.percentile(values, at)) for key, at in _PERCENTILES.items()},
+                "max": _six_digits(values.max()),
+                "zero": _six_digits(np.mean(values == 0)),
             }
     return found
 
@@ -190,8 +190,8 @@ def _directions(cell: CellTally) -> Row | None:
     return {
         "grasps": len(vectors),
         "empty": int((counts == 0).sum()),
-        "evenness": _six(evenness(counts.ravel().tolist(), DIRECTION_CELLS)),
-        "entropy_bits": _six(entropy_bits(counts.ravel().tolist())),
+        "evenness": _six_digits(evenness(counts.ravel().tolist(), DIRECTION_CELLS)),
+        "entropy_bits": _six_digits(entropy_bits(counts.ravel().tolist())),
     }
 
 
@@ -201,7 +201,7 @@ def _types(cell: CellTally) -> Row | None:
     if not len(told):
         return None
     counts = {kind.name.lower(): int((told == kind).sum()) for kind in GraspType}
-    return {**{name: n for name, n in counts.items() if n}, "entropy_bits": _six(entropy_bits(counts.values()))}
+    return {**{name: n for name, n in counts.items() if n}, "entropy_bits": _six_digits(entropy_bits(counts.values()))}
 
 
 def _taxonomy(cell: CellTally) -> Row | None:
@@ -210,7 +210,7 @@ def _taxonomy(cell: CellTally) -> Row | None:
     if not len(told):
         return None
     shares = {name: float((told == number).mean()) for name, number in TAXONOMY.items()}
-    return {name: _six(value) for name, value in sorted(shares.items(), key=lambda one: -one[1]) if value}
+    return {name: _six_digits(value) for name, value in sorted(shares.items(), key=lambda one: -one[1]) if value}
 
 
 def _cells(contents: Contents, tally: Tally) -> list[Row]:
@@ -241,14 +241,14 @@ def _diversity(cell: CellTally) -> float | None:
         return None
     parts = [np.concatenate([getattr(part, name) for part in cell.sample]) for name in ("hand_pose", "joint_positions")]
     explained = explained_variance(Posture(*parts))
-    return _six(explained[0]) if len(explained) else None
+    return _six_digits(explained[0]) if len(explained) else None
 
 
-def _repeated(cell: CellTally) -> int:
+def _duplicate_count(cell: CellTally) -> int:
     prints = np.concatenate([np.empty(0, np.int64), *cell.prints])
     return len(prints) - len(np.unique(prints))
 
 
-def _six(value: float | np.floating[Any] | NDArray[Any]) -> float:
+def _six_digits(value: float | np.floating[Any] | NDArray[Any]) -> float:
     """Round to six significant digits for JSON."""
     return float(f"{float(value):.6g}")

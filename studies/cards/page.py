@@ -122,13 +122,13 @@ def quality_table(card: Row) -> str:
             continue
         found = [card["quality"][hand].get(metric.name) for hand in hands]
         if any(found):
-            lines.append(f"| {metric.heading} | {' | '.join(_spread(one, metric.digits) for one in found)} |")
+            lines.append(f"| {metric.heading} | {' | '.join(_percentile_text(one, metric.digits) for one in found)} |")
         else:
             missing.append(metric.heading)
     return "\n".join(lines) + (f"\n\nNot measured: {', '.join(missing)}." if missing else "")
 
 
-def _spread(found: Row | None, digits: int) -> str:
+def _percentile_text(found: Row | None, digits: int) -> str:
     if found is None:
         return "-"
     return f"{found['median']:.{digits}f} ({found['p5']:.{digits}f} to {found['p95']:.{digits}f})"

@@ -26,12 +26,16 @@ _DPI: Final = 110
 def draw(card: Row, tally: Tally, folder: Path) -> dict[str, str]:
     """Write all plots that have data; return their captions by file name, in the order of the card."""
     plots: tuple[tuple[str, str, Callable[[Row, Tally], Any]], ...] = (
-        ("yield.png", "Valid share of validated grasps, by hand and object", _yields),
-        ("quality.png", "Distribution of each quality over the valid grasps, by hand", _qualities),
-        ("directions.png", "Approach directions of the palm, by hand", _directions),
-        ("table.png", "Share of the valid grasps that are clear of the table in at least one scene", _table),
-        ("joints.png", "Range that each joint uses between its limits", _joints),
-        ("sizes.png", "Valid share of validated grasps over the size of the object", _sizes),
+        ("yield.png", "Valid share of validated grasps, by hand and object", _plot_yields),
+        ("quality.png", "Distribution of each quality over the valid grasps, by hand", _plot_qualities),
+        ("directions.png", "Approach directions of the palm, by hand", _plot_directions),
+        (
+            "table.png",
+            "Share of the valid grasps that are clear of the table in at least one scene",
+            _plot_table_scenes,
+        ),
+        ("joints.png", "Range that each joint uses between its limits", _plot_joints),
+        ("sizes.png", "Valid share of validated grasps over the size of the object", _plot_sizes),
     )
     written = {}
     for name, shows, make in plots:
@@ -53,13 +57,13 @@ def _names(card: Row, what: str) -> list[str]:
     return [asset["name"] for asset in card["composition"][what]]
 
 
-def _plain(axes: Any) -> None:
+def _style_axes(axes: Any) -> None:
     axes.grid(alpha=0.25)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _yields(card: Row, tally: Tally) -> Any:
+def _plot_yields(card: Row, tally: Tally) -> Any:
     hands, objects = _names(card, "hands"), _names(card, "objects")
     shares = np.full((len(objects), len(hands)), np.nan)
     rows = {(cell["hand"], cell["object"]): cell for cell in card["cells"] if cell["of_validated"] is not None}
@@ -84,7 +88,7 @@ def _yields(card: Row, tally: Tally) -> Any:
     return figure
 
 
-def _qualities(card: Row, tally: Tally) -> Any:
+def _plot_qualities(card: Row, tally: Tally) -> Any:
     hands = _names(card, "hands")
     shown = [entry for entry in _QUALITIES if any(entry[1] in card["quality"][hand] for hand in hands)]
     if not shown:
@@ -104,7 +108,7 @@ def _qualities(card: Row, tally: Tally) -> Any:
                 axes.hist(np.minimum(values, top), bins, weights=weights, label=hand, **style)
         axes.set_xlabel(f"{title} (last bin: all above)" if cut else title, fontsize=9)
         axes.tick_params(labelsize=8)
-        _plain(axes)
+        _style_axes(axes)
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     figure.supylabel("% of the hand's valid grasps", fontsize=9)
@@ -112,7 +116,7 @@ def _qualities(card: Row, tally: Tally) -> Any:
     return figure
 
 
-def _directions(card: Row, tally: Tally) -> Any:
+def _plot_directions(card: Row, tally: Tally) -> Any:
     """Plot directions of palms in the object's frame, and by elevation over the table.
     The top row has the former, the bottom row the latter."""
     hands = [hand for hand in _names(card, "hands") if card["directions"]["by_hand"][hand]][:_PANELS]
@@ -135,7 +139,7 @@ def _directions(card: Row, tally: Tally) -> Any:
         axes.set_title(hand, fontsize=10)
         if with_table and hand in card["elevation"]:
             below = figure.add_subplot(grid[1, column], sharey=below)
-            _elevations(below, card["elevation"][hand], first=column == 0)
+            _plot_elevations(below, card["elevation"][hand], first=column == 0)
     figure.colorbar(mesh, ax=figure.axes[-1 if not with_table else -2], shrink=0.7, label="1: uniform", extend="max")
     figure.suptitle(
         "top: in the object's frame, z up; bottom: elevation over the table", fontsize=9, color=INK, x=0.01, ha="left"
@@ -143,7 +147,7 @@ def _directions(card: Row, tally: Tally) -> Any:
     return figure
 
 
-def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) -> None:
+def _plot_elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) -> None:
     edges = np.linspace(-90, 90, len(sums["all"]) + 1)
     for name, colour, label in (("all", "#cbd5e1", "all pairs"), ("clear", COLOURS[0], "clear of the table")):
         axes.stairs(sums[name], edges, fill=True, color=colour, label=label)
@@ -152,13 +156,13 @@ def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) ->
     axes.stairs(even, edges, color=INK, linestyle="--", linewidth=1, label="uniform directions")
     axes.set_xticks([-90, -45, 0, 45, 90], ["below", "-45°", "side", "45°", "above"], fontsize=8)
     axes.tick_params(labelsize=8)
-    _plain(axes)
+    _style_axes(axes)
     if first:
         axes.set_ylabel("pairs of grasp and scene", fontsize=9)
         axes.figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=8)
 
 
-def _table(card: Row, tally: Tally) -> Any:
+def _plot_table_scenes(card: Row, tally: Tally) -> Any:
     hands, objects = _names(card, "hands"), _names(card, "objects")
     rows = [cell for cell in card["cells"] if cell["clear_of_table"] is not None]
     if not rows:
@@ -175,12 +179,12 @@ def _table(card: Row, tally: Tally) -> Any:
     axes.set_yticks(range(len(order)) if named else [], order if named else [], fontsize=8)
     axes.set_xlim(-0.02 * axes.get_xlim()[1], None)
     axes.set_xlabel("% of the valid grasps that are clear in at least one scene", fontsize=9)
-    _plain(axes)
+    _style_axes(axes)
     figure.legend(loc="outside upper right", ncols=8, frameon=False)
     return figure
 
 
-def _joints(card: Row, tally: Tally) -> Any:
+def _plot_joints(card: Row, tally: Tally) -> Any:
     hands = [hand for hand in _names(card, "hands") if card["joints"].get(hand)][:_PANELS]
     if not hands:
         return None
@@ -205,7 +209,7 @@ def _joints(card: Row, tally: Tally) -> Any:
     return figure
 
 
-def _sizes(card: Row, tally: Tally) -> Any:
+def _plot_sizes(card: Row, tally: Tally) -> Any:
     sizes = {obj["name"]: sorted(obj["extents_m"]) for obj in card["composition"]["objects"] if obj["extents_m"]}
     rows = [cell for cell in card["cells"] if cell["object"] in sizes and cell["of_validated"] is not None]
     if not rows:
@@ -221,7 +225,7 @@ def _sizes(card: Row, tally: Tally) -> Any:
         axes.set_xlabel(f"{what} extent of the object, mm", fontsize=9)
         axes.tick_params(labelsize=8)
         axes.set(xlim=(0, None), ylim=(0, 103))
-        _plain(axes)
+        _style_axes(axes)
     panels[0].set_ylabel("valid share of validated grasps, %", fontsize=9)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, frameon=False)
     return figure

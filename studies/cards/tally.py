@@ -18,7 +18,7 @@ from graspd.service.store import validity
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
 from graspd.studies.cards.contents import AssetFacts, Contents, Pair, ShardContents
 from graspd.worker.grasps import Posture
-from graspd.worker.quality.diversity import cells_of
+from graspd.worker.quality.diversity import direction_cells
 
 BINS: Final = 200  # number of bins between a joint's limits
 
@@ -35,7 +35,7 @@ class JointUse:
     counts: NDArray[np.int64]  # (J, BINS) counts of grasps
 
     @classmethod
-    def of(cls, names: tuple[str, ...], facts: Mapping[str, Any]) -> JointUse:
+    def from_hand_facts(cls, names: tuple[str, ...], facts: Mapping[str, Any]) -> JointUse:
         """Return empty histograms for the joints with limits in the hand's facts."""
         lower, upper = dict(facts.get("lower", {})), dict(facts.get("upper", {}))
         known = tuple(name for name in names if name in lower and upper[name] > lower[name])
@@ -93,7 +93,7 @@ class CellTally:
     sample: list[Posture] = field(default_factory=list)
 
     @classmethod
-    def of(cls, cells: Iterable[CellTally]) -> CellTally:
+    def merge(cls, cells: Iterable[CellTally]) -> CellTally:
         """Return the sums of several cells, without `prints` and `sample`."""
         out = cls()
         for cell in cells:
@@ -106,7 +106,7 @@ class CellTally:
                 out.columns.setdefault(name, []).extend(parts)
         return out
 
-    def pack(self) -> None:
+    def merge_arrays(self) -> None:
         """Merge the arrays of many shards, because thousands of small arrays need ten times the memory."""
         every: list[list[Any]] = [*self.columns.values(), self.towards, self.prints]
         for parts in every:
@@ -141,10 +141,10 @@ class Tally:
     threshold_m: Counter[float] = field(default_factory=Counter)
 
     def of_hand(self, hand: str) -> CellTally:
-        return CellTally.of(cell for (name, _), cell in self.cells.items() if name == hand)
+        return CellTally.merge(cell for (name, _), cell in self.cells.items() if name == hand)
 
     def of_object(self, obj: str) -> CellTally:
-        return CellTally.of(cell for (_, name), cell in self.cells.items() if name == obj)
+        return CellTally.merge(cell for (_, name), cell in self.cells.items() if name == obj)
 
 
 _ATTRIBUTES: Final = (
@@ -163,7 +163,7 @@ def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
         if (pair, piece.file.batch) != batch_now:
             batch_now, valid = (pair, piece.file.batch), {}
         cell = tally.cells.setdefault(pair, CellTally())
-        _note(tally, cell, piece)
+        _add_metadata(tally, cell, piece)
         hand = contents.hands.get(piece.file.hand, AssetFacts(piece.file.hand))
         if piece.file.kind == "base":
             valid[piece.file.id] = _add_base(tally, cell, piece, hand)
@@ -174,7 +174,7 @@ def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
     return tally
 
 
-def _note(tally: Tally, cell: CellTally, piece: ShardContents) -> None:
+def _add_metadata(tally: Tally, cell: CellTally, piece: ShardContents) -> None:
     kind = piece.file.kind
     tally.shards[kind] += 1
     tally.bytes[kind] += piece.size_bytes
@@ -218,7 +218,7 @@ def _add_base(tally: Tally, cell: CellTally, piece: ShardContents, hand: AssetFa
             kept = (values[:, at] if metric.swept else values)[valid].astype(np.float32)
             cell.columns.setdefault(metric.name, []).append(kept)
     _add_postures(tally, cell, piece, hand, valid)
-    cell.pack()
+    cell.merge_arrays()
     return valid
 
 
@@ -233,7 +233,7 @@ def _add_postures(tally: Tally, cell: CellTally, piece: ShardContents, hand: Ass
     if held < SAMPLED and len(pose):
         cell.sample.append(Posture(pose[: SAMPLED - held], joints[: SAMPLED - held]))
     if names := piece.said.get("joint_names"):
-        use = tally.joints.setdefault(piece.file.hand, JointUse.of(tuple(names), hand.facts))
+        use = tally.joints.setdefault(piece.file.hand, JointUse.from_hand_facts(tuple(names), hand.facts))
         use.add(tuple(names), joints)
 
 
@@ -269,7 +269,7 @@ ELEVATION_BINS: Final = 36  # number of bins of elevations from -90 to 90 degree
 def cell_counts(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
     """Return (bands, sectors) counts of unit vectors (N, 3).
     They start at the lowest band and at azimuth -180 degrees."""
-    cells = cells_of(np.asarray(directions).reshape(-1, 3), bands, sectors)
+    cells = direction_cells(np.asarray(directions).reshape(-1, 3), bands, sectors)
     return np.bincount(cells, minlength=bands * sectors).reshape(bands, sectors)
 
 

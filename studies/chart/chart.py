@@ -15,7 +15,7 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.studies.bench import device_name
 from graspd.studies.chart.statistics import rounded_json_value, run_figures, summarise_runs
-from graspd.studies.chart.trials import FRICTION, Rollout, Setting
+from graspd.studies.chart.trials import FRICTION, Setting, SettingRuns
 from graspd.studies.evaluation import THRESHOLD_M
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
@@ -37,7 +37,7 @@ class ChartObject:
     load: Callable[[float], ObjectModel]
 
 
-def chart(
+def measure_chart(
     hands: Sequence[HandModel],
     things: Sequence[ChartObject],
     settings: Sequence[Setting],
@@ -55,7 +55,7 @@ def chart(
         for hand in hands:
             true = thing.load(TRUE_ERROR_M)
             pieces = decompose(true)
-            cells = [Rollout(s, hand, thing.load(s.knobs.face_error_m), true, pieces) for s in settings]
+            cells = [SettingRuns(s, hand, thing.load(s.knobs.face_error_m), true, pieces) for s in settings]
             for cell in cells:
                 cell.warm_up()
             for _ in range(repeats):
@@ -64,8 +64,8 @@ def chart(
                     cell.time_first(cell.setting.run.cores)
             for cell in cells:
                 cell.validate_strictly(models)
-                runs.append(_row(cell, hand, thing))
-                say(_line(runs[-1]))
+                runs.append(_combination_row(cell, hand, thing))
+                say(_progress_line(runs[-1]))
             keep(_result(runs, settings, models))
     return _result(runs, settings, models)
 
@@ -87,14 +87,14 @@ def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting], models:
     }
 
 
-def _row(cell: Rollout, hand: HandModel, thing: ChartObject) -> dict[str, Any]:
+def _combination_row(cell: SettingRuns, hand: HandModel, thing: ChartObject) -> dict[str, Any]:
     setting = cell.setting
     names = {"method": setting.method, "fidelity": setting.fidelity, "hand": hand.name, "object": thing.name}
     best = {key: rounded_json_value(value) for key, value in cell.best().items()}
     return {**names, "options": dict(setting.options), **run_figures(cell), "best": best}
 
 
-def _line(run: dict[str, Any]) -> str:
+def _progress_line(run: dict[str, Any]) -> str:
     return (
         f"{run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
         f"{run['end_to_end_per_second']:8.3f} valid/s  dexgraspbench {run['dexgraspbench']:.2f}  hard "
@@ -121,8 +121,8 @@ def settings_of(
     A method without fidelities has one setting. It has `batches[0]` grasps per call by default, or `baseline_batch` if
     the method has an option `steps`, because such grasps take seconds each. Raises InputError: a method or an option is
     unknown."""
-    variants = [_variant(text) for text in methods]
-    given = _options_of(options, [name for name, _, _ in variants])
+    variants = [_parse_method(text) for text in methods]
+    given = _parse_options(options, [name for name, _, _ in variants])
     found: list[Setting] = []
     for name, changes, size_given in variants:
         known = method(name)
@@ -138,7 +138,7 @@ def settings_of(
     return found
 
 
-def _variant(text: str) -> tuple[str, dict[str, str], int | None]:
+def _parse_method(text: str) -> tuple[str, dict[str, str], int | None]:
     """Parse a method such as `graspit:keep=20@40` into name, options and grasps per call."""
     found = _VARIANT.fullmatch(text)
     if found is None:
@@ -148,7 +148,7 @@ def _variant(text: str) -> tuple[str, dict[str, str], int | None]:
     return name, changes, int(size) if size else None
 
 
-def _options_of(texts: Sequence[str], methods: Sequence[str]) -> Mapping[str, dict[str, str]]:
+def _parse_options(texts: Sequence[str], methods: Sequence[str]) -> Mapping[str, dict[str, str]]:
     found: dict[str, dict[str, str]] = {}
     for text in texts:
         name, colon, rest = text.partition(":")

@@ -61,9 +61,9 @@ def draw(rows: Rows, files: Sequence[Path]) -> None:
     styles, words = _styles(rows), "valid grasps per second, end to end"
     labels = []
     for axes, (title, key) in zip(panels.flat[:5], PANELS, strict=True):
-        labels += _over_speed(axes, rows, styles, key, title, words)
+        labels += _draw_over_speed(axes, rows, styles, key, title, words)
     last, timed = panels.flat[5], [row for row in rows if row["seconds_to_first_valid"]]
-    labels += _panel(last, timed, styles, x="seconds_to_first_valid", y="dexgraspbench")
+    labels += _draw_panel(last, timed, styles, x="seconds_to_first_valid", y="dexgraspbench")
     last.set(xlabel="seconds to the first valid grasp, end to end (less is better)", ylim=(-0.07, 1.04))
     last.set_title("Success under the DexGraspBench protocol", loc="left", fontsize=11)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
@@ -81,7 +81,7 @@ def draw_hands(
     styles = _styles([row for rows in by_hand.values() for row in rows])
     labels = []
     for axes, (hand, rows) in zip(panels.flat, by_hand.items(), strict=False):
-        labels += _over_speed(axes, rows, styles, key, hand, words[1], label)
+        labels += _draw_over_speed(axes, rows, styles, key, hand, words[1], label)
     for axes in panels.flat[len(by_hand) :]:
         axes.set_visible(False)
     figure.supylabel(words[0], fontsize=10)
@@ -95,12 +95,12 @@ def _save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
         figure.savefig(file, dpi=150)
 
 
-def _over_speed(
+def _draw_over_speed(
     axes: Any, rows: Rows, styles: Styles, key: str, title: str, words: str, label: PointLabel | None = None
 ) -> list[Label]:
     """Plot one accuracy over the speed, with the Pareto front; return the labels of the points."""
     known = [row for row in rows if row[key] is not None]
-    labels = _panel(axes, known, styles, x=SPEED, y=key, label=label)
+    labels = _draw_panel(axes, known, styles, x=SPEED, y=key, label=label)
     front = sorted((row for row in known if key in row["front"] and row[SPEED]), key=lambda row: row[SPEED])
     style = {"color": INK, "linewidth": 1, "linestyle": "--", "alpha": 0.6, "zorder": 1, "label": "Pareto front"}
     axes.step([row[SPEED] for row in front], [row[key] for row in front], where="pre", **style)
@@ -120,10 +120,10 @@ def draw_scenes(rows: Rows, files: Sequence[Path], *, second: str) -> None:
     words = f"lifted grasps per {second}, end to end"
     labels = []
     for axes, (title, key) in zip(panels.flat[:4], IN_SCENES, strict=True):
-        labels += _over_speed(axes, rows, styles, key, title, words, fidelity_label)
+        labels += _draw_over_speed(axes, rows, styles, key, title, words, fidelity_label)
     timed = [row for row in rows if row["seconds_to_first"]]
     last = panels.flat[4]
-    labels += _panel(last, timed, styles, x="seconds_to_first", y="lift", label=fidelity_label)
+    labels += _draw_panel(last, timed, styles, x="seconds_to_first", y="lift", label=fidelity_label)
     last.set(xlabel=f"{second}s to the first that is lifted (less is better)", ylim=(-0.07, 1.07))
     last.set_title("Lifted, by settings with a lift in every pair", loc="left", fontsize=11)
     panels.flat[5].set_visible(False)
@@ -136,7 +136,9 @@ def _styles(rows: Rows) -> Styles:
     return {m: (COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, m in enumerate(methods)}
 
 
-def _panel(axes: Any, rows: Rows, styles: Styles, *, x: str, y: str, label: PointLabel | None = None) -> list[Label]:
+def _draw_panel(
+    axes: Any, rows: Rows, styles: Styles, *, x: str, y: str, label: PointLabel | None = None
+) -> list[Label]:
     shown: set[str] = set()
     labels = []
     for row in rows:
@@ -145,7 +147,7 @@ def _panel(axes: Any, rows: Rows, styles: Styles, *, x: str, y: str, label: Poin
         none = not row[x]
         at = valid_rate_bound(row) if none else row[x]
         bars: dict[str, Any] = {
-            f"{axis}err": _error(row, key) for axis, key in (("x", x), ("y", y)) if f"{key}_low" in row
+            f"{axis}err": _error_bar(row, key) for axis, key in (("x", x), ("y", y)) if f"{key}_low" in row
         }
         if none:
             bars |= {"xerr": [[0.55 * at], [0.0]], "xuplims": True}
@@ -157,20 +159,22 @@ def _panel(axes: Any, rows: Rows, styles: Styles, *, x: str, y: str, label: Poin
         shown.add(row["method"])
         text = (label or _label)(row, rows)
         words = ", ".join(filter(None, (text, f"0 of {row['grasps']}" * none)))
-        ends = {f"{axis}_bar": _ends(row, key) for axis, key in (("x", x), ("y", y)) if not (none and axis == "x")}
+        ends = {
+            f"{axis}_bar": _error_bar_ends(row, key) for axis, key in (("x", x), ("y", y)) if not (none and axis == "x")
+        }
         labels.append(Label(axes, at, row[y], words, colour, **({"x_bar": (0.45 * at, at)} if none else {}), **ends))
-    _logarithmic(axes, [label.x * (0.5 if "0 of" in label.text else 1.0) for label in labels])
+    _set_logarithmic(axes, [label.x * (0.5 if "0 of" in label.text else 1.0) for label in labels])
     top = max([row[f"{y}_high"] for row in rows] or [1.0])
     axes.set_ylim(-0.09 * top, 1.08 * top)
     plain_axes(axes)
     return labels
 
 
-def _ends(row: Row, key: str) -> tuple[float, float] | None:
+def _error_bar_ends(row: Row, key: str) -> tuple[float, float] | None:
     return (row[f"{key}_low"], row[f"{key}_high"]) if f"{key}_low" in row else None
 
 
-def _logarithmic(axes: Any, values: Sequence[float]) -> None:
+def _set_logarithmic(axes: Any, values: Sequence[float]) -> None:
     """Set a logarithmic axis of at least one decade, with plain numbers and space for labels on the right."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -184,7 +188,7 @@ def _logarithmic(axes: Any, values: Sequence[float]) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _error(row: Row, key: str) -> list[list[float]]:
+def _error_bar(row: Row, key: str) -> list[list[float]]:
     return [[max(0.0, row[key] - row[f"{key}_low"])], [max(0.0, row[f"{key}_high"] - row[key])]]
 
 
@@ -216,8 +220,10 @@ def draw_sweeps(rows: Rows, file: Path) -> None:
         for row in own:
             face = COLOURS[0] if row["default"] else "white"
             style = {"fmt": "o", "color": COLOURS[0], "markerfacecolor": face, "markersize": 6}
-            axes.errorbar(row["speedup"], row["gsr"], yerr=_error(row, "gsr"), capsize=2, elinewidth=1, **style)
-            labels.append(Label(axes, row["speedup"], row["gsr"], str(row["value"]), INK, y_bar=_ends(row, "gsr")))
+            axes.errorbar(row["speedup"], row["gsr"], yerr=_error_bar(row, "gsr"), capsize=2, elinewidth=1, **style)
+            labels.append(
+                Label(axes, row["speedup"], row["gsr"], str(row["value"]), INK, y_bar=_error_bar_ends(row, "gsr"))
+            )
         axes.set_title(knob, loc="left", fontsize=10)
         axes.set_ylim(0, 1.05)
         plain_axes(axes)
@@ -267,18 +273,18 @@ def place_labels(figure: Any, labels: Sequence[Label]) -> list[Any]:
     figure.draw_without_rendering()
     made = []
     for axes in dict.fromkeys(label.axes for label in labels):
-        made += _place(axes, figure.dpi / 72.0, [label for label in labels if label.axes is axes])
+        made += _place_labels_on_axes(axes, figure.dpi / 72.0, [label for label in labels if label.axes is axes])
     return made
 
 
-def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
+def _place_labels_on_axes(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
     points = axes.transData.transform([(label.x, label.y) for label in labels])
     markers = np.hstack([points - _MARKER_PT * pixels, points + _MARKER_PT * pixels])
-    bars = _bars(axes, labels, _BAR_PT * pixels)
+    bars = _error_bar_boxes(axes, labels, _BAR_PT * pixels)
     panel = axes.get_window_extent()
     inside = np.array([panel.x0, panel.y0, panel.x1, panel.y1])
     worded = [index for index, label in enumerate(labels) if label.text]
-    offered = {index: _candidates(points[index], _size(axes, labels[index].text), pixels) for index in worded}
+    offered = {index: _label_positions(points[index], _text_size(axes, labels[index].text), pixels) for index in worded}
     fixed = {index: _fixed_costs(offered[index], points, index, bars, inside) for index in worded}
     chosen = dict.fromkeys(worded, 0)
     # Each label in turn moves to the best place among the other labels, until no label moves.
@@ -286,7 +292,7 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
         before = dict(chosen)
         for index in worded:
             solid = np.vstack([markers, *(offered[other][chosen[other]] for other in worded if other != index)])
-            costs = [_COVERED * _share(box, solid) for box in offered[index]]
+            costs = [_COVERED * _covered_share(box, solid) for box in offered[index]]
             chosen[index] = int(np.argmin(np.array(costs) + fixed[index]))
         if chosen == before:
             break
@@ -295,15 +301,15 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
         box = offered[index][at]
         # A line connects a label with its point if the label is far away or nearer to another point.
         led = at // len(_TURNS) > 1 or _is_nearer_to_another(box, points, index)
-        made.append(_write(axes, labels[index], points[index], box, pixels, led=led))
+        made.append(_draw_label(axes, labels[index], points[index], box, pixels, led=led))
     return made
 
 
 def _fixed_costs(boxes: Sequence[Boxes], points: Boxes, own: int, bars: Boxes, inside: Boxes) -> Boxes:
     return np.array(
         [
-            _CROSSED * _share(box, bars)
-            + _OUTSIDE * (1.0 - _share(box, inside[None]))
+            _CROSSED * _covered_share(box, bars)
+            + _OUTSIDE * (1.0 - _covered_share(box, inside[None]))
             + _FARTHER * (at // len(_TURNS))
             + _TURNED * (at % len(_TURNS))
             + _TAKEN * _is_nearer_to_another(box, points, own)
@@ -317,7 +323,7 @@ def _is_nearer_to_another(box: Boxes, points: Boxes, own: int) -> bool:
     return bool(np.any(np.delete(away, own) < away[own]))
 
 
-def _write(axes: Any, label: Label, point: Boxes, box: Boxes, pixels: float, *, led: bool) -> Any:
+def _draw_label(axes: Any, label: Label, point: Boxes, box: Boxes, pixels: float, *, led: bool) -> Any:
     from matplotlib.patheffects import withStroke
 
     offset = (box[:2] - point) / pixels
@@ -331,7 +337,7 @@ def _write(axes: Any, label: Label, point: Boxes, box: Boxes, pixels: float, *, 
     return note
 
 
-def _size(axes: Any, text: str) -> tuple[float, float]:
+def _text_size(axes: Any, text: str) -> tuple[float, float]:
     """Return width and height of a label [px]."""
     sample = axes.annotate(text, (0.5, 0.5), xycoords="axes fraction", fontsize=SIZE_PT)
     extent = sample.get_window_extent()
@@ -339,7 +345,7 @@ def _size(axes: Any, text: str) -> tuple[float, float]:
     return float(extent.width), float(extent.height)
 
 
-def _candidates(point: Boxes, size: tuple[float, float], pixels: float) -> list[Boxes]:
+def _label_positions(point: Boxes, size: tuple[float, float], pixels: float) -> list[Boxes]:
     """Return boxes (left, bottom, right, top) [px] around the point, preferred ones first."""
     found = []
     for reach, turn in product(_REACHES_PT, _TURNS):
@@ -356,7 +362,7 @@ def _side(part: float) -> float:
     return 0.0 if abs(part) < 0.2 else math.copysign(1.0, part)
 
 
-def _bars(axes: Any, labels: Sequence[Label], half: float) -> Boxes:
+def _error_bar_boxes(axes: Any, labels: Sequence[Label], half: float) -> Boxes:
     ends = [((low, label.y), (high, label.y)) for label in labels if label.x_bar for low, high in [label.x_bar]]
     ends += [((label.x, low), (label.x, high)) for label in labels if label.y_bar for low, high in [label.y_bar]]
     if not ends:
@@ -367,7 +373,7 @@ def _bars(axes: Any, labels: Sequence[Label], half: float) -> Boxes:
     return np.hstack([corners[:, :2] - half, corners[:, 2:] + half])
 
 
-def _share(box: Boxes, boxes: Boxes) -> float:
+def _covered_share(box: Boxes, boxes: Boxes) -> float:
     """Return the covered share of a box's area; overlaps count for each covering box."""
     if not len(boxes):
         return 0.0

@@ -15,24 +15,24 @@ from graspd.studies.chart.statistics import valid_rate_bound
 Row = Mapping[str, Any]
 
 
-def _with_bars(*names: str) -> tuple[str, ...]:
+def _names_with_bounds(*names: str) -> tuple[str, ...]:
     return tuple(f"{name}{end}" for name in names for end in ("", "_low", "_high"))
 
 
 #: Columns of the CSV file, one row per run.
 COLUMNS: Final = (
     *("method", "fidelity", "batch", "hand", "object", "grasps", "valid", "repeats", "grasps_per_second", "kept"),
-    *_with_bars("end_to_end_per_second"),
+    *_names_with_bounds("end_to_end_per_second"),
     "seconds_to_first_valid",
-    *_with_bars("valid_per_second", "dexgraspbench", "hard", "robust", "gsr", "epsilon", "pd_mm"),
+    *_names_with_bounds("valid_per_second", "dexgraspbench", "hard", "robust", "gsr", "epsilon", "pd_mm"),
     *("spd_mm", "ca_cm2", "iv_cm3", "wrench_volume"),
 )
 SCENE_COLUMNS: Final = (
     *("way", "method", "fidelity", "hand", "object", "scenes", "grasps", "seconds", "end_seconds"),
     *("clear_count", "lift_count", "lift_dexgraspbench_count", "lift_hard_count", "clear"),
-    *_with_bars("lift", "lift_dexgraspbench", "lift_hard", "robust"),
+    *_names_with_bounds("lift", "lift_dexgraspbench", "lift_hard", "robust"),
     "grasps_per_second",
-    *_with_bars("valid_per_second", "end_to_end_per_second"),
+    *_names_with_bounds("valid_per_second", "end_to_end_per_second"),
     *("seconds_to_first", "note"),
 )
 
@@ -124,16 +124,16 @@ def summary_table(rows: Sequence[Row]) -> str:
         "| --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
     for row in sorted(rows, key=lambda r: -r[SPEED]):
-        cells = [row["method"], row["fidelity"], row["batch"], _with_bar(row, SPEED, ".3g")]
+        cells = [row["method"], row["fidelity"], row["batch"], _value_with_error(row, SPEED, ".3g")]
         cells += [_format(row["seconds_to_first_valid"], ".2g"), f"{row['valid_per_second']:.3g}"]
         for key, form in ACCURACIES:
-            text = _with_bar(row, key, form)
+            text = _value_with_error(row, key, form)
             cells.append(f"**{text}**" if key in row["front"] else text)
         lines.append("| " + " | ".join(map(str, [*cells, row["grasps"]])) + " |")
     return "\n".join(lines)
 
 
-def _with_bar(row: Row, key: str, form: str) -> str:
+def _value_with_error(row: Row, key: str, form: str) -> str:
     if row[key] is None:
         return "–"
     half = (row[f"{key}_high"] - row[f"{key}_low"]) / 2
@@ -216,8 +216,8 @@ def sweeps_table(sweeps: Sequence[Row]) -> str:
     ]
     lines += [
         f"| {row['knob']} | {row['value']}{' (default)' if row['default'] else ''} "
-        f"| {1.0 / row['grasps_per_second']:.3g} | × {row['speedup']:.2f} | {_with_bar(row, 'gsr', '.2f')} "
-        f"| {_with_bar(row, 'epsilon', '.3f')} | {_with_bar(row, 'pd_mm', '.2f')} |"
+        f"| {1.0 / row['grasps_per_second']:.3g} | × {row['speedup']:.2f} | {_value_with_error(row, 'gsr', '.2f')} "
+        f"| {_value_with_error(row, 'epsilon', '.3f')} | {_value_with_error(row, 'pd_mm', '.2f')} |"
         for row in sweeps
     ]
     return "\n".join(lines)
@@ -234,11 +234,17 @@ def with_mode_name(row: Row) -> dict[str, Any]:
 
 
 def _scene_page(chart: Row) -> str:
-    parts = [_scene_head(chart), "![Speed against lifts](chart.png)", _summary(chart["summary"], time_unit(chart))]
+    parts = [
+        _scene_head(chart),
+        "![Speed against lifts](chart.png)",
+        _scene_summary_table(chart["summary"], time_unit(chart)),
+    ]
     if len(chart["by_hand"]) > 1:
         parts += ["## Each hand", "![Lifted over speed](chart.hands.png)"]
-        parts += [f"### {hand}\n\n{_summary(rows, time_unit(chart))}" for hand, rows in chart["by_hand"].items()]
-    parts += ["## Each hand and object", _runs(chart["runs"], time_unit(chart))]
+        parts += [
+            f"### {hand}\n\n{_scene_summary_table(rows, time_unit(chart))}" for hand, rows in chart["by_hand"].items()
+        ]
+    parts += ["## Each hand and object", _scene_runs_table(chart["runs"], time_unit(chart))]
     if refused := [run for run in chart["runs"] if run["note"]]:
         lines = [f"- {r['method']} {r['fidelity']}, {r['hand']}, {r['object']}: {r['note']}" for r in refused]
         parts += ["## Refused", "\n".join(lines)]
@@ -265,7 +271,7 @@ def _scene_head(chart: Row) -> str:
     )
 
 
-def _summary(rows: Sequence[Row], second: str) -> str:
+def _scene_summary_table(rows: Sequence[Row], second: str) -> str:
     lines = [
         "| mode | method | fidelity | candidates | clear | lifted | dexgraspbench | half friction | robust | "
         f"lifted per {second} | planner only | {second}s to the first lift | pairs with a lift | × filtered |",
@@ -289,7 +295,7 @@ def _bold(row: Row, key: str) -> str:
     return f"**{_format(row[key])}**" if key in row["front"] else _format(row[key])
 
 
-def _runs(runs: Sequence[Row], second: str) -> str:
+def _scene_runs_table(runs: Sequence[Row], second: str) -> str:
     lines = [
         "| hand | object | mode | method | fidelity | candidates | clear | lifted | dexgraspbench | half friction | "
         f"robust | lifted per {second} |",

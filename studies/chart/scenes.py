@@ -23,13 +23,13 @@ from graspd.service.model.studies import FILTERED, IN_SCENE, IN_SCENES
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from graspd.studies.bench import clock_of, device_name
 from graspd.studies.chart.chart import TRUE_ERROR_M, ChartObject
-from graspd.studies.chart.statistics import first_valid, mark_fronts, rounded_json_value
+from graspd.studies.chart.statistics import mark_fronts, rounded_json_value, seconds_to_valid
 from graspd.studies.chart.trials import FRICTION, MODELS_SEED, SEED, WARM_SEED, Setting
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners import method
-from graspd.worker.quality.intervals import wilson, wilson_of_mean
+from graspd.worker.quality.intervals import wilson_interval, wilson_interval_of_mean
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.rollout import lift_rollout
@@ -61,17 +61,17 @@ class ObjectScenes:
     spec: SceneSpec
 
     @cached_property
-    def true(self) -> ObjectModel:
+    def validator_object(self) -> ObjectModel:
         """The validator's object, the same for all settings."""
         return self.thing.load(TRUE_ERROR_M)
 
     @cached_property
     def pieces(self) -> ConvexPieces:
-        return decompose(self.true)
+        return decompose(self.validator_object)
 
     @cached_property
     def scenes(self) -> Scenes:
-        poses = rest_poses(self.spec, self.true, count=4, seed=SEED)["scene/object_pose"]
+        poses = rest_poses(self.spec, self.validator_object, count=4, seed=SEED)["scene/object_pose"]
         return Scenes(supports_of(self.spec), poses)
 
 
@@ -95,7 +95,7 @@ def scene_chart(
         for hand in hands:
             for setting, way in _planning_modes(settings):
                 runs.append(_cached_result(setting, way, hand, place, models, work))
-                say(_line(runs[-1]))
+                say(_progress_line(runs[-1]))
             keep(_result(runs, settings, spec, models))
     return _result(runs, settings, spec, models)
 
@@ -114,7 +114,15 @@ def _cached_result(
     if work is None:
         return said | _run_setting(setting, way, hand, place, models)
     told = place.spec.model_dump(mode="json")
-    terms = [FORM, models, said, setting.knobs.model_dump(mode="json"), told, hand.digest, place.true.digest]
+    terms = [
+        FORM,
+        models,
+        said,
+        setting.knobs.model_dump(mode="json"),
+        told,
+        hand.digest,
+        place.validator_object.digest,
+    ]
     # Results also depend on revision of the planners and device.
     device = [] if setting.run.device == "cpu" else [setting.run.device]
     file = work / f"{digest_json([*terms, STAGE_REVISIONS['synthesize'], *device])}.json"
@@ -160,7 +168,7 @@ def _run_setting(setting: Setting, way: str, hand: HandModel, place: ObjectScene
         note = str(error)  # the scene has no free approach, or the method refuses the pair
     row["first_grasps"] = few
     told = lift_figures([row])
-    told["seconds_to_first"] = first_valid(told["lift"], [row["first_seconds"]], few)
+    told["seconds_to_first"] = seconds_to_valid(told["lift"], [row["first_seconds"]], few)
     return {**row, **told, "scenes": len(place.scenes.object_pose), "note": note}
 
 
@@ -168,18 +176,20 @@ class ValidatedGrasps:
     """Grasps with trajectories and lift verdicts; the metrics of lifted grasps are only timed."""
 
     def __init__(self, hand: HandModel, place: ObjectScenes, grasps: GraspSet, placed: PlacedGrasps) -> None:
-        way = plan_trajectory(hand, place.true, grasps, placed)
+        way = plan_trajectory(hand, place.validator_object, grasps, placed)
         self.grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
         self.hand, self.place, self.placed = hand, place, placed
         self.clear = np.flatnonzero(way.clear)
-        self.lifted = self._lifting(self.clear)
-        measure(hand, place.true, self.grasps.take(self.lifted), friction=FRICTION)
+        self.lifted = self._lifted_rows(self.clear)
+        measure(hand, place.validator_object, self.grasps.take(self.lifted), friction=FRICTION)
 
-    def _lifting(self, rows: NDArray[np.intp], **options: Any) -> NDArray[np.intp]:
+    def _lifted_rows(self, rows: NDArray[np.intp], **options: Any) -> NDArray[np.intp]:
         if not len(rows):
             return rows
         grasps, placed = self.grasps.take(rows), self.placed.take(rows)
-        found = validate_lifts(self.hand, self.place.true, grasps, placed, pieces=self.place.pieces, **options)
+        found = validate_lifts(
+            self.hand, self.place.validator_object, grasps, placed, pieces=self.place.pieces, **options
+        )
         return rows[found.success == 1]
 
     def counts(self, models: int) -> Row:
@@ -187,12 +197,12 @@ class ValidatedGrasps:
         lifted = self.lifted
         grasps, placed = self.grasps.take(lifted), self.placed.take(lifted)
         given: dict[str, Any] = {"models": models, "seed": MODELS_SEED, "pieces": self.place.pieces}
-        shares = validate_robustness(self.hand, self.place.true, grasps, placed=placed, **given).share
+        shares = validate_robustness(self.hand, self.place.validator_object, grasps, placed=placed, **given).share
         return {
             "clear_count": len(self.clear),
             "lift_count": len(lifted),
-            "lift_dexgraspbench_count": len(self._lifting(self.clear, level="dexgraspbench")),
-            "lift_hard_count": len(self._lifting(lifted, hard=True)),
+            "lift_dexgraspbench_count": len(self._lifted_rows(self.clear, level="dexgraspbench")),
+            "lift_hard_count": len(self._lifted_rows(lifted, hard=True)),
             "robust_sum": float(shares.sum()),
         }
 
@@ -204,7 +214,7 @@ def lift_figures(rows: Sequence[Mapping[str, Any]]) -> Row:
     found: Row = {"grasps": grasps}
     for name in SHARES:
         count = sum(row[f"{name}_count"] for row in rows)
-        low, high = wilson(count, grasps)
+        low, high = wilson_interval(count, grasps)
         found |= {f"{name}_count": count, name: count / grasps, f"{name}_low": low, f"{name}_high": high}
     planned = sum(row["grasps"] for row in rows if row["seconds"])
     for speed, key in SPEEDS:
@@ -213,7 +223,7 @@ def lift_figures(rows: Sequence[Mapping[str, Any]]) -> Row:
         for end in ("", "_low", "_high"):
             found[f"{speed}{end}"] = found[f"lift{end}"] * grasps / seconds if seconds else 0.0
     total, lifted = sum(row["robust_sum"] for row in rows), found["lift_count"]
-    bar = wilson_of_mean(total, lifted) if lifted else (None, None)
+    bar = wilson_interval_of_mean(total, lifted) if lifted else (None, None)
     mean = total / lifted if lifted else None
     found |= {"robust_sum": total, "robust": mean, "robust_low": bar[0], "robust_high": bar[1]}
     return {key: rounded_json_value(value) for key, value in found.items()}
@@ -260,7 +270,7 @@ def _result(runs: Sequence[Row], settings: Sequence[Setting], spec: SceneSpec, m
     }
 
 
-def _line(run: Row) -> str:
+def _progress_line(run: Row) -> str:
     return (
         f"{run['way']:14s} {run['method']:11s} {run['fidelity']:13s} {run['hand']:18s} {run['object']:20s} "
         f"{run['end_to_end_per_second']:8.3f} lifted/s  clear {run['clear']:.2f}  lift {run['lift']:.2f}  "

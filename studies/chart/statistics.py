@@ -7,10 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from graspd.service.model.studies import pareto
+from graspd.service.model.studies import pareto_front
 from graspd.service.model.transforms import Floats
-from graspd.studies.chart.trials import Rollout
-from graspd.worker.quality.intervals import wilson, wilson_of_mean
+from graspd.studies.chart.trials import SettingRuns
+from graspd.worker.quality.intervals import wilson_interval, wilson_interval_of_mean
 
 #: Number of bootstrap draws; error bars are their 2.5 and 97.5 percentiles.
 DRAWS: Final = 400
@@ -22,7 +22,7 @@ SPEEDS: Final = ("valid_per_second", "end_to_end_per_second")  # speeds that are
 MEDIANS: Final = ("epsilon", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "wrench_volume")
 
 
-def run_figures(cell: Rollout) -> dict[str, Any]:
+def run_figures(cell: SettingRuns) -> dict[str, Any]:
     """Return speed and accuracy of a run, each with error bar `KEY_low`, `KEY_high`."""
     held, kept = (np.concatenate(rows).astype(float) for rows in (cell.success, cell.kept))
     seconds = np.array(cell.seconds)
@@ -34,50 +34,50 @@ def run_figures(cell: Rollout) -> dict[str, Any]:
         "end_seconds": [round(s, 6) for s in cell.end_seconds],
         "kept": int(kept.sum()),
         "end_to_end_per_second": kept.sum() / sum(cell.end_seconds),
-        "seconds_to_first_valid": first_valid(float(kept.mean()), cell.first_calls, cell.first_grasps),
+        "seconds_to_first_valid": seconds_to_valid(float(kept.mean()), cell.first_calls, cell.first_grasps),
         "valid_per_second": held.sum() / seconds.sum(),
         "gsr": held.mean(),
         "batch": cell.setting.batch,
         "repeats": len(seconds),
     }
     row |= {key: float(np.median(cell.values(key))) for key in MEDIANS}
-    for key, values in _draws(cell).items():
+    for key, values in _bootstrap_draws(cell).items():
         row[f"{key}_low"], row[f"{key}_high"] = np.percentile(values, BAR)
-    widen(row, int(held.sum()), len(held), len(held) / float(seconds.sum()))
-    widen_speed(row, "end_to_end_per_second", int(kept.sum()), len(kept), len(kept) / sum(cell.end_seconds))
+    widen_intervals(row, int(held.sum()), len(held), len(held) / float(seconds.sum()))
+    widen_speed_interval(row, "end_to_end_per_second", int(kept.sum()), len(kept), len(kept) / sum(cell.end_seconds))
     row |= _strict_success(cell) if cell.dexgraspbench else {}
     return {key: rounded_json_value(value) for key, value in row.items()}
 
 
-def widen(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
+def widen_intervals(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
     """Set the bar of success to Wilson's interval; widen the bar of the speed to contain this interval."""
-    row["gsr_low"], row["gsr_high"] = wilson(valid, grasps)
-    widen_speed(row, "valid_per_second", valid, grasps, per_second)
+    row["gsr_low"], row["gsr_high"] = wilson_interval(valid, grasps)
+    widen_speed_interval(row, "valid_per_second", valid, grasps, per_second)
 
 
-def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_second: float) -> None:
+def widen_speed_interval(row: dict[str, Any], key: str, valid: int, grasps: int, per_second: float) -> None:
     """Widen the bar of the speed `key` to contain Wilson's interval of the share of valid grasps."""
-    low, high = wilson(valid, grasps)
+    low, high = wilson_interval(valid, grasps)
     row[f"{key}_low"] = min(row[f"{key}_low"], low * per_second)
     row[f"{key}_high"] = max(row[f"{key}_high"], high * per_second)
 
 
-def _strict_success(cell: Rollout) -> dict[str, Any]:
+def _strict_success(cell: SettingRuns) -> dict[str, Any]:
     """Return success by DexGraspBench's protocol and at half friction, and robust share of held grasps."""
     row: dict[str, Any] = {}
     for key, verdicts in (("dexgraspbench", cell.dexgraspbench), ("hard", cell.hard)):
         held = np.concatenate(verdicts) == 1
         row[key] = float(held.mean())
-        row[f"{key}_low"], row[f"{key}_high"] = wilson(int(held.sum()), len(held))
+        row[f"{key}_low"], row[f"{key}_high"] = wilson_interval(int(held.sum()), len(held))
     shares = np.concatenate(cell.shares)
     known = shares[np.isfinite(shares)]
     if not len(known):
         return row | dict.fromkeys(("robust", "robust_low", "robust_high"))
-    low, high = wilson_of_mean(float(known.sum()), len(known))
+    low, high = wilson_interval_of_mean(float(known.sum()), len(known))
     return row | {"robust": float(known.mean()), "robust_low": low, "robust_high": high}
 
 
-def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | None:
+def seconds_to_valid(share: float, seconds: Sequence[float], grasps: int) -> float | None:
     """Return expected seconds until a call gives a valid grasp; None if no grasp was valid.
     A call has `grasps` grasps, of which the given share is valid, and takes the median of `seconds`."""
     if share <= 0 or not seconds:
@@ -85,7 +85,7 @@ def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | 
     return float(np.median(seconds)) / (1.0 - (1.0 - share) ** grasps)
 
 
-def _draws(cell: Rollout) -> dict[str, Floats]:
+def _bootstrap_draws(cell: SettingRuns) -> dict[str, Floats]:
     """Bootstrap: resample repeats, then grasps within each."""
     rng = np.random.default_rng(0)
     repeats = len(cell.seconds)
@@ -123,14 +123,14 @@ def summarise_runs(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             # Robustness is undefined for a pair without held grasps.
             known = [r for r in own if r[key] is not None]
             row[key] = float(np.mean([r[key] for r in known])) if known else None
-            row[f"{key}_low"], row[f"{key}_high"] = _bar(known, key) if known else (None, None)
+            row[f"{key}_low"], row[f"{key}_high"] = _error_bar(known, key) if known else (None, None)
         row["valid_per_second"] = valid / seconds
         kept, end = sum(r["kept"] for r in own), sum(sum(r["end_seconds"]) for r in own)
         row["end_to_end_per_second"] = kept / end
         for key, times in zip(SPEEDS, ("seconds", "end_seconds"), strict=True):
             row[f"{key}_low"], row[f"{key}_high"] = (_ratio_bar(own, key, times, side) for side in ("low", "high"))
-        widen(row, valid, row["grasps"], row["grasps_per_second"])
-        widen_speed(row, "end_to_end_per_second", kept, row["grasps"], row["grasps"] / end)
+        widen_intervals(row, valid, row["grasps"], row["grasps_per_second"])
+        widen_speed_interval(row, "end_to_end_per_second", kept, row["grasps"], row["grasps"] / end)
         row["candidates_end_to_end_per_second"] = row["grasps"] / end
         rows.append({key: rounded_json_value(value) for key, value in row.items()})
     mark_fronts(rows, METRICS)
@@ -144,11 +144,11 @@ def mark_fronts(rows: Sequence[dict[str, Any]], metrics: Mapping[str, bool]) -> 
     for key, more in metrics.items():
         # Methods without valid grasps are excluded, since hands without contact have no penetration.
         able = [row for row in rows if row["end_to_end_per_second"] and row[key] is not None]
-        for index in pareto([(row["end_to_end_per_second"], row[key] if more else -row[key]) for row in able]):
+        for index in pareto_front([(row["end_to_end_per_second"], row[key] if more else -row[key]) for row in able]):
             able[index]["front"].append(key)
 
 
-def _bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:
+def _error_bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:
     """Return the bar of the mean over independent pairs: half-widths added in quadrature."""
     mean = float(np.mean([r[key] for r in runs]))
     down = np.sqrt(np.sum([(r[key] - r[f"{key}_low"]) ** 2 for r in runs])) / len(runs)

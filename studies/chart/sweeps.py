@@ -18,7 +18,7 @@ from graspd.service.model.fidelity import FIDELITIES, Fidelity
 from graspd.studies.chart import kernels
 from graspd.studies.chart.chart import TRUE_ERROR_M, ChartObject
 from graspd.studies.chart.statistics import rounded_json_value, run_figures
-from graspd.studies.chart.trials import Rollout, Setting
+from graspd.studies.chart.trials import Setting, SettingRuns
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
@@ -44,7 +44,7 @@ class KnobValue:
     change: Change | None = None
 
     @property
-    def default(self) -> bool:
+    def is_default(self) -> bool:
         return self.fidelity == DEFAULT and self.change is None
 
 
@@ -87,7 +87,7 @@ def knob_values(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValu
     return [*found[:2], *(turn for turn in found if turn.knob == "queries")] if quick else found
 
 
-def sweep(
+def sweep_settings(
     hand: HandModel,
     thing: ChartObject,
     *,
@@ -104,12 +104,14 @@ def sweep(
     default = KnobValue("", "default")
     true = thing.load(TRUE_ERROR_M)
     pieces = decompose(true)
-    cells: dict[tuple[str, str], Rollout] = {}
+    cells: dict[tuple[str, str], SettingRuns] = {}
     for turn in [default, *knob_values(quick, knobs)]:
-        if turn is default or not turn.default:
-            make = partial(_make, turn=turn, run=run)
+        if turn is default or not turn.is_default:
+            make = partial(_plan_value, turn=turn, run=run)
             setting = Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, run=run, make=make)
-            cells[turn.knob, turn.value] = Rollout(setting, hand, thing.load(turn.fidelity.face_error_m), true, pieces)
+            cells[turn.knob, turn.value] = SettingRuns(
+                setting, hand, thing.load(turn.fidelity.face_error_m), true, pieces
+            )
     for _ in range(repeats):
         for cell in cells.values():
             # There are more settings than the device caches, so each is prepared just before it is timed.
@@ -118,15 +120,21 @@ def sweep(
     base = run_figures(cells[default.knob, default.value])
     rows = []
     for turn in knob_values(quick, knobs):
-        found = base if turn.default else run_figures(cells[turn.knob, turn.value])
+        found = base if turn.is_default else run_figures(cells[turn.knob, turn.value])
         faster = found["grasps_per_second"] / base["grasps_per_second"]
-        row = {"knob": turn.knob, "value": turn.value, "default": turn.default, "hand": hand.name, "object": thing.name}
+        row = {
+            "knob": turn.knob,
+            "value": turn.value,
+            "default": turn.is_default,
+            "hand": hand.name,
+            "object": thing.name,
+        }
         rows.append(row | {"speedup": rounded_json_value(faster), **found})
         say(f"{turn.knob:22s} {turn.value:18s} x {faster:5.2f}  GSR {found['gsr']:.2f}  PD {found['pd_mm']:.2f} mm")
     return rows
 
 
-def _make(
+def _plan_value(
     hand: HandModel, obj: ObjectModel, count: int, seed: int, *, turn: KnobValue, run: ExecutionContext
 ) -> GraspSet:
     began = time.perf_counter()

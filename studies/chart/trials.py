@@ -22,7 +22,7 @@ from graspd.worker.planners import PlanRequest, synthesize
 from graspd.worker.planners import Rollout as Tried
 from graspd.worker.quality.gate import passes_gate
 from graspd.worker.quality.table import measure
-from graspd.worker.scenes.rollout import rollout_on
+from graspd.worker.scenes.rollout import create_rollout
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.displacement import simulated_displacement_cm
@@ -75,7 +75,7 @@ class Setting:
 
 
 @dataclass
-class Rollout:
+class SettingRuns:
     """Accumulated repeats of a setting on a pair."""
 
     setting: Setting
@@ -103,7 +103,7 @@ class Rollout:
     @cached_property
     def planner_rollout(self) -> Tried | None:
         """Rollouts of candidates, as in jobs."""
-        return rollout_on(self.setting.run, self.hand, self.obj, lambda: self.pieces, in_scenes=False)
+        return create_rollout(self.setting.run, self.hand, self.obj, lambda: self.pieces, in_scenes=False)
 
     @property
     def _clock(self) -> Callable[[], float]:
@@ -121,7 +121,7 @@ class Rollout:
         self.seconds.append(self._clock() - began)
         success, feasible, table = self._validate_and_measure(found)
         self.end_seconds.append(self._clock() - began)
-        lost = self._measured(found.take(np.flatnonzero(success != 1)))
+        lost = self._measure(found.take(np.flatnonzero(success != 1)))
         self.made.append(found)
         self.success.append(success)
         self.kept.append(feasible)
@@ -135,12 +135,12 @@ class Rollout:
         """Return verdicts (N,), valid flags (N,), and metrics of held grasps, as in a job."""
         success = validate(self.hand, self.true, found, pieces=self.pieces, run=self.setting.run).success
         held = np.flatnonzero(success == 1)
-        table = self._measured(found.take(held))
+        table = self._measure(found.take(held))
         kept = np.zeros(len(found), np.int8)
         kept[held] = table.pop("feasible")
         return success, kept, table
 
-    def _measured(self, found: GraspSet) -> dict[str, Floats]:
+    def _measure(self, found: GraspSet) -> dict[str, Floats]:
         table = measure(
             self.hand, self.true, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], run=self.setting.run
         )

@@ -35,7 +35,7 @@ BOUNDS: Final = "weak: below 0.5; broken: 0, or a value that is not finite"
 SHOWS: Final = "few or no valid grasps; the job reports that its budget is used up"
 
 
-def sheet(thickness_mm: float) -> Any:
+def plate_mesh(thickness_mm: float) -> Any:
     """Return a plate of 80 x 60 mm."""
     return trimesh.creation.box((0.08, 0.06, thickness_mm * MILLIMETRES))
 
@@ -48,13 +48,13 @@ def wedge(angle_deg: float) -> Any:
     return trimesh.convex.convex_hull(np.concatenate(ends))
 
 
-def tunnel(diameter_mm: float) -> Any:
+def ring_mesh(diameter_mm: float) -> Any:
     """Return a thick ring: a wall of 15 mm around a hole of the given diameter."""
     inner = diameter_mm * MILLIMETRES / 2
     return trimesh.creation.annulus(inner, inner + 0.015, 0.05, sections=48)
 
 
-def corner(depth_mm: float) -> Any:
+def cross_mesh(depth_mm: float) -> Any:
     """Return a cross of two bars, with four concave corners of the given depth."""
     deep = depth_mm * MILLIMETRES
     arms = [trimesh.creation.box((0.03 + 2 * deep, 0.03, 0.05)), trimesh.creation.box((0.03, 0.03 + 2 * deep, 0.05))]
@@ -78,10 +78,10 @@ def box_with_defect(name: str) -> Any:
 
 #: Family -> unit of its parameter, constructor, parameters.
 FAMILIES: Final[dict[str, tuple[str, Callable[[float], Any], tuple[float, ...]]]] = {
-    "plate": ("thickness [mm]", sheet, (0.2, 0.5, 1, 2, 5, 10)),
+    "plate": ("thickness [mm]", plate_mesh, (0.2, 0.5, 1, 2, 5, 10)),
     "wedge": ("angle of the edge [deg]", wedge, (5, 10, 20, 40, 80)),
-    "ring": ("diameter of the hole [mm]", tunnel, (4, 8, 16, 32, 64)),
-    "cross": ("depth of the corners [mm]", corner, (2, 5, 10, 20)),
+    "ring": ("diameter of the hole [mm]", ring_mesh, (4, 8, 16, 32, 64)),
+    "cross": ("depth of the corners [mm]", cross_mesh, (2, 5, 10, 20)),
     "cube": ("side [mm]", cube, (1, 3, 10, 30, 60, 100, 200, 500, 1000)),
 }
 _ALLOW_OPEN: Final = "a side is missing, --allow-open"
@@ -150,7 +150,7 @@ def shape_cell(
     `asked` is the job's fidelity or method."""
     request = JobRequest(hand="hand", object="shape", grasps=options.count, want="candidates", rechecks=0, **asked)
     try:
-        obj = prepare_mesh(mesh, request.knobs.face_error_m, allow_open=allow_open)
+        obj = prepare_mesh(mesh, request.resolved_fidelity.face_error_m, allow_open=allow_open)
         found = validated_grasps(hand, obj, request, count=options.count, run=options.run)
     except GraspdError as error:
         return refused_cell(*place, error)
@@ -190,33 +190,35 @@ def ring_hand(fingers: int, *, coupling: Coupling = "each joint", size: float = 
     """Return a hand of equal fingers around a palm, of a size relative to a human hand.
     `ratio` is the rotation of a coupled distal joint over that of the middle joint. Raises HandError: unusable."""
     radius, height = (size * x for x in _PALM_M)
-    parts = [f'<robot name="ring"><link name="palm">{_solid("cylinder", -height / 2, radius, height)}</link>']
+    parts = [f'<robot name="ring"><link name="palm">{_shape_element("cylinder", -height / 2, radius, height)}</link>']
     for k in range(fingers):
         angle = 2 * np.pi * k / fingers
         at = f"{radius * np.cos(angle):.6f} {radius * np.sin(angle):.6f} 0"
-        parts += _finger(k, f'<origin xyz="{at}" rpy="0 {_LEAN} {angle:.6f}"/>', coupling, size, ratio)
+        parts += _finger_elements(k, f'<origin xyz="{at}" rpy="0 {_LEAN} {angle:.6f}"/>', coupling, size, ratio)
     files = {"ring.urdf": "\n".join([*parts, "</robot>"]).encode()}
     return load_hand(files, name=f"ring of {fingers}", digest=digest_files(AssetKind.HAND, files))
 
 
-def _finger(k: int, base: str, coupling: Coupling, size: float, ratio: float) -> list[str]:
+def _finger_elements(k: int, base: str, coupling: Coupling, size: float, ratio: float) -> list[str]:
     parts, before = [], "palm"
     for j, (length, end) in enumerate(zip(_LINKS_M, _ENDS, strict=True)):
         name, long = f"finger_{k}_{j}", size * length
-        solid = _solid("cylinder", long / 2, size * _RADIUS_M, long) + _solid("sphere", long, size * _RADIUS_M, 0)
+        solid = _shape_element("cylinder", long / 2, size * _RADIUS_M, long) + _shape_element(
+            "sphere", long, size * _RADIUS_M, 0
+        )
         origin = base if j == 0 else f'<origin xyz="0 0 {size * _LINKS_M[j - 1]:.6f}"/>'
         low, high = sorted((0.0, end * ratio / 0.8)) if j == 2 and coupling == "distal follows" else (0.0, end)
         parts += [
             f'<link name="{name}">{solid}</link>',
             f'<joint name="joint_{k}_{j}" type="revolute"><parent link="{before}"/><child link="{name}"/>{origin}'
             f'<axis xyz="0 -1 0"/><limit lower="{low}" upper="{high}" effort="{_EFFORT * size}" velocity="3"/>'
-            f"{_mimic(k, j, coupling, ratio)}</joint>",
+            f"{_mimic_element(k, j, coupling, ratio)}</joint>",
         ]
         before = name
     return parts
 
 
-def _mimic(k: int, j: int, coupling: Coupling, ratio: float) -> str:
+def _mimic_element(k: int, j: int, coupling: Coupling, ratio: float) -> str:
     """Return the mimic element of a joint that follows another one; empty for driven joints."""
     leads = {
         "each joint": (k, j),
@@ -231,7 +233,7 @@ def _mimic(k: int, j: int, coupling: Coupling, ratio: float) -> str:
     return f'<mimic joint="joint_{lead[0]}_{lead[1]}" multiplier="{follows:.6f}" offset="0"/>'
 
 
-def _solid(kind: str, height: float, radius: float, length: float) -> str:
+def _shape_element(kind: str, height: float, radius: float, length: float) -> str:
     size = f' length="{length:.6f}"' if kind == "cylinder" else ""
     shape = f'<geometry><{kind} radius="{radius:.6f}"{size}/></geometry>'
     return f'<collision><origin xyz="0 0 {height:.6f}"/>{shape}</collision>'

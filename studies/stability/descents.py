@@ -41,7 +41,7 @@ RESIDUAL: Final = (0.35, 0.9)
 
 
 @dataclass(frozen=True)
-class Descent:
+class DescentResult:
     state: HandState
     depths: Floats  # (n,) deepest penetration after the projection, as in a job [m]
     drift: float  # largest deviation of a quaternion's norm from 1, before the projection normalises it
@@ -56,7 +56,7 @@ def descend(
     weights: float = 1.0,
     iterations: int | None = None,
     optimizer: str = "adam",
-) -> Descent:
+) -> DescentResult:
     """Run coarse phase, fine phase and projection from the hands `state`.
     `rates` and `weights` are factors on the optimiser's rates and on the weights of penetration. `iterations` is the
     length of the fine phase; beyond the fidelity's, the schedule's last row is repeated."""
@@ -71,13 +71,13 @@ def descend(
             object_penetration=weights * schedule.object_penetration,
         )
         steps = len(schedule) if side is pair.coarse or iterations is None else iterations
-        data.set_schedule(_lengthened(scaled, steps))
+        data.set_schedule(_lengthen_schedule(scaled, steps))
         data.set_state(state)
         record_iteration(model, data, optimizer).run(steps)
         state = data.state(n)
     drift = float(np.abs(np.linalg.norm(state.rotation, axis=1) - 1.0).max())
     state, depths = Projection(model, data, AROUND).run(state, fidelity.polish_iterations)
-    return Descent(state, depths, drift)
+    return DescentResult(state, depths, drift)
 
 
 def start_map(hand: HandModel, obj: ObjectModel, *, count: int, say: Say) -> StabilityMap:
@@ -169,7 +169,7 @@ def starts_of(pair: Pair, count: int) -> HandState:
     return sample_starts(pair.model(pair.coarse), seed=11, batch=0, indices=range(count), each=1)
 
 
-def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | str) -> list[MapCell]:
+def _cells(pair: Pair, found: DescentResult, panel: str, x: float | str, y: float | str) -> list[MapCell]:
     state = found.state
     finite = bool(np.isfinite(state.pivot).all() and np.isfinite(state.q).all() and np.isfinite(state.rotation).all())
     if not finite:
@@ -184,7 +184,7 @@ def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | st
     return [MapCell(panel, x, y, residual, deep if is_deep else held, said, label)]
 
 
-def _lengthened(schedule: Schedule, iterations: int) -> Schedule:
+def _lengthen_schedule(schedule: Schedule, iterations: int) -> Schedule:
     """Return the schedule with its last row repeated."""
     rows = np.minimum(np.arange(max(iterations, len(schedule))), len(schedule) - 1)
     return replace(schedule, **{field.name: getattr(schedule, field.name)[rows] for field in fields(schedule)})

@@ -13,7 +13,7 @@ import warp as wp
 
 from graspd.service.model.studies import MapCell, StabilityMap, grade, mark_reachable
 from graspd.service.model.transforms import Floats
-from graspd.studies.stability.integrators import Solver, sweep
+from graspd.studies.stability.integrators import Solver, gauss_seidel_sweep
 from graspd.worker.simulation import reference
 from graspd.worker.simulation.kernels import contact, kinematics, packing
 from graspd.worker.simulation.model import initial_motions
@@ -28,7 +28,7 @@ ANGLE: Final = (0.25, 0.7)  # sine of the angle between the two gradients that c
 #: Kernel of each solver, and its step in the reference.
 SOLVERS: Final[dict[str, tuple[Any, Solver]]] = {
     "direct": (contact.direct, partial(reference.direct, passes=PASSES)),
-    "gauss_seidel": (contact.gauss_seidel, sweep),
+    "gauss_seidel": (contact.gauss_seidel, gauss_seidel_sweep),
     "jacobi": (contact.jacobi, partial(reference.jacobi, passes=PASSES)),
 }
 
@@ -89,7 +89,7 @@ def reference_gradient(name: str, contacts: Contacts, world: World) -> Floats:
 def gradient_map(sizes: Sequence[float], gaps: Sequence[float], *, repeats: int) -> StabilityMap:
     cells = []
     for name, size, gap in product(SOLVERS, sizes, gaps):
-        worst = float(np.median([_angle(name, size, gap, seed) for seed in range(repeats)]))
+        worst = float(np.median([_gradient_sine(name, size, gap, seed) for seed in range(repeats)]))
         cells.append(MapCell(name, size, gap, worst, grade(worst, *ANGLE)))
     return StabilityMap(
         "gradient",
@@ -116,7 +116,7 @@ def _physics(world: World, leak: float, one_sided: bool, near_gap: float, radius
     return out
 
 
-def _angle(name: str, size: float, gap: float, seed: int) -> float:
+def _gradient_sine(name: str, size: float, gap: float, seed: int) -> float:
     count, rng = 8, np.random.default_rng(seed)
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

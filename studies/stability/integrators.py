@@ -66,7 +66,7 @@ def ball_world(dt: float, speed: float) -> World:
     return World(inertia, gyration=gyration, friction=FRICTION, stiffness=1.0, step=max(dt * speed, 1e-9))
 
 
-def position_based(solver: Solver, *, dt: float, speed: float) -> tuple[float, float]:
+def simulate_position_based(solver: Solver, *, dt: float, speed: float) -> tuple[float, float]:
     """Return a ball's ratio of largest to initial energy, and deepest penetration [m], with a `solver`."""
     points = _cage_around(dt, speed)
     world = ball_world(dt, speed)
@@ -82,8 +82,8 @@ def position_based(solver: Solver, *, dt: float, speed: float) -> tuple[float, f
     return _extremes(points, flight())
 
 
-def force_based(*, dt: float, speed: float, stiffness: float, mass: float = 1.0) -> tuple[float, float]:
-    """Return the values of `position_based` for penalty forces; `stiffness` [N/m], `mass` [kg]."""
+def simulate_force_based(*, dt: float, speed: float, stiffness: float, mass: float = 1.0) -> tuple[float, float]:
+    """Return the values of `simulate_position_based` for penalty forces; `stiffness` [N/m], `mass` [kg]."""
     points = _cage_around(dt, speed)
     inertia = 0.4 * mass * RADIUS_M**2
 
@@ -127,7 +127,7 @@ def _largest_depth(points: Floats, centre: Floats) -> float:
     return max(0.0, RADIUS_M - float(np.linalg.norm(points - centre, axis=1).min()))
 
 
-def sweep(contacts: Contacts, s0: Floats, world: World) -> Floats:
+def gauss_seidel_sweep(contacts: Contacts, s0: Floats, world: World) -> Floats:
     return reference.gauss_seidel(contacts, s0, world)[0]
 
 
@@ -138,7 +138,7 @@ def summed_jacobi(contacts: Contacts, s0: Floats, world: World) -> Floats:
     for _ in range(8):
         total = np.zeros(6)
         for p, n, rho in zip(contacts.points, contacts.normals, contacts.distances, strict=True):
-            j = reference.row(n, p)
+            j = reference.jacobian_row(n, p)
             c = world.dilation - rho + j @ s
             if c > 0:
                 total -= c / (j @ inverse @ j) * (inverse @ j)
@@ -148,7 +148,7 @@ def summed_jacobi(contacts: Contacts, s0: Floats, world: World) -> Floats:
 
 SOLVERS: Final[dict[str, Solver]] = {
     "direct (default)": partial(reference.direct, passes=6),
-    "Gauss-Seidel, one sweep": sweep,
+    "Gauss-Seidel, one sweep": gauss_seidel_sweep,
     "Jacobi, averaged": partial(reference.jacobi, passes=8),
     "Jacobi, summed": summed_jacobi,
 }
@@ -158,12 +158,12 @@ _OFFERED: Final = tuple(SOLVERS)[:3]  # solvers that the setting `contact_solver
 def time_step_map(time_steps: Sequence[float], speeds: Sequence[float]) -> StabilityMap:
     grid = list(product(time_steps, speeds))
     cells = [
-        _ball_cell(name, dt, speed, position_based(solver, dt=dt, speed=speed))
+        _ball_cell(name, dt, speed, simulate_position_based(solver, dt=dt, speed=speed))
         for name, solver in SOLVERS.items()
         for dt, speed in grid
     ]
     cells += [
-        _ball_cell(f"penalty force, {name} N/m", dt, speed, force_based(dt=dt, speed=speed, stiffness=k))
+        _ball_cell(f"penalty force, {name} N/m", dt, speed, simulate_force_based(dt=dt, speed=speed, stiffness=k))
         for name, k in (("1e4", 1e4), ("1e6", 1e6))
         for dt, speed in grid
     ]
@@ -201,13 +201,16 @@ def stiffness_map(stiffnesses: Sequence[float], masses: Sequence[float], time_st
     for mass in masses:
         panel = f"penalty force, {mass:g} kg"
         for stiffness, dt in product(stiffnesses, time_steps):
-            found = force_based(dt=dt, speed=0.3, stiffness=stiffness, mass=mass)
+            found = simulate_force_based(dt=dt, speed=0.3, stiffness=stiffness, mass=mass)
             cells.append(_ball_cell(panel, stiffness, dt, found))
         # Semi-implicit Euler on m x'' = -k x is stable for dt < 2 sqrt(m / k).
         lines[panel] = [(k, 2 * math.sqrt(mass / k)) for k in stiffnesses]
     cells += [
         _ball_cell(
-            "direct (has no stiffness setting)", k, dt, position_based(SOLVERS["direct (default)"], dt=dt, speed=0.3)
+            "direct (has no stiffness setting)",
+            k,
+            dt,
+            simulate_position_based(SOLVERS["direct (default)"], dt=dt, speed=0.3),
         )
         for k in stiffnesses
         for dt in time_steps

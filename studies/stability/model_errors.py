@@ -53,12 +53,12 @@ class _Error:
     variant: Make
 
 
-def _along(direction: Direction, length: float) -> Vector:
+def _scaled_direction(direction: Direction, length: float) -> Vector:
     x, y, z = (length * direction).tolist()
     return x, y, z
 
 
-def _lags(hand: HandModel, latest: float) -> tuple[float, ...]:
+def _finger_lags(hand: HandModel, latest: float) -> tuple[float, ...]:
     fingers = len(hand.fingertips)
     return tuple((latest * np.arange(fingers) / max(1, fingers - 1)).tolist())
 
@@ -81,21 +81,21 @@ ERRORS: Final[dict[str, _Error]] = {
         (0.005, 0.01, 0.02, 0.05, 0.1, 0.2), (0.0, DRY_FRICTION * FACTOR), lambda h, x, d: Variant(dry_friction=x)
     ),
     "object displaced by [mm]": _Error(
-        (1, 2, 4, 8, 16), (0.0, SHIFT_M / _MM), lambda h, x, d: Variant(object_shift_m=_along(d, x * _MM))
+        (1, 2, 4, 8, 16), (0.0, SHIFT_M / _MM), lambda h, x, d: Variant(object_shift_m=_scaled_direction(d, x * _MM))
     ),
     "object rotated by [°]": _Error(
         (1, 2, 5, 10, 20),
         (0.0, float(np.degrees(TURN))),
-        lambda h, x, d: Variant(object_turn=_along(d, float(np.radians(x)))),
+        lambda h, x, d: Variant(object_turn=_scaled_direction(d, float(np.radians(x)))),
     ),
     "hand displaced by [mm]": _Error(
-        (1, 2, 4, 8, 16), (0.0, SHIFT_M / _MM), lambda h, x, d: Variant(hand_shift_m=_along(d, x * _MM))
+        (1, 2, 4, 8, 16), (0.0, SHIFT_M / _MM), lambda h, x, d: Variant(hand_shift_m=_scaled_direction(d, x * _MM))
     ),
     "centre of mass displaced by [mm]": _Error(
-        (2, 5, 10, 20, 40), (0.0, CENTRE_M / _MM), lambda h, x, d: Variant(centre_m=_along(d, x * _MM))
+        (2, 5, 10, 20, 40), (0.0, CENTRE_M / _MM), lambda h, x, d: Variant(centre_m=_scaled_direction(d, x * _MM))
     ),
     "last finger delayed by [share of closing]": _Error(
-        (0.1, 0.25, 0.5, 0.75), (0.0, LATEST), lambda h, x, d: Variant(lags=_lags(h, x))
+        (0.1, 0.25, 0.5, 0.75), (0.0, LATEST), lambda h, x, d: Variant(lags=_finger_lags(h, x))
     ),
 }
 

@@ -52,7 +52,7 @@ def markdown(found: Stability) -> str:
         lines += [f"## {one.title}", "", f"![{one.title}](stability-{one.name}.png)", ""]
         lines += [f"Value of a cell: {one.measure}. {one.bounds[0].upper()}{one.bounds[1:]}.", ""]
         lines += ["| panel | good | weak | broken | refused |", "| --- | --: | --: | --: | --: |"]
-        lines += [f"| {panel} | {_row(one.of(panel))} |" for panel in one.panels]
+        lines += [f"| {panel} | {_row(one.panel_cells(panel))} |" for panel in one.panels]
         lines += ["", f"- symptom: {one.shows}", f"- guard: {one.guard}"]
         if one.guard_test:
             lines.append(f"- test of the guard: `{one.guard_test}`")
@@ -67,7 +67,7 @@ def _unguarded_failures(maps: Sequence[StabilityMap]) -> list[str]:
     lines += ["", "| map | good | weak | broken | refused | remaining failures | symptom |"]
     lines += ["| --- | --: | --: | --: | --: | --- | --- |"]
     for one in maps:
-        broken = one.still_breaks()
+        broken = one.broken_cell_lines()
         seen = one.shows if broken else "–"
         lines.append(f"| {one.title} | {_row(one.reached())} | {'<br>'.join(broken) or 'nothing'} | {seen} |")
     return [*lines, ""]
@@ -85,7 +85,7 @@ def draw(one: StabilityMap, path: Path) -> None:
     panels = one.panels
     columns = min(_COLUMNS, len(panels))
     rows = math.ceil(len(panels) / columns)
-    tallest = max(len({cell.y for cell in one.of(panel)}) for panel in panels)
+    tallest = max(len({cell.y for cell in one.panel_cells(panel)}) for panel in panels)
     height = min(3.4, 1.0 + 0.5 * tallest)
     figure = Figure(figsize=(max(4.4 * columns, 7.0), height * rows + 0.9), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
@@ -95,31 +95,31 @@ def draw(one: StabilityMap, path: Path) -> None:
         axes.set_visible(False)
     present = [outcome for outcome, number in count_outcomes(one.cells).items() if number]
     handles = [Patch(color=COLOURS[outcome][0], label=outcome) for outcome in OUTCOMES if outcome in present]
-    if one.is_divided:
+    if one.is_partly_reachable:
         handles.append(Patch(facecolor="none", edgecolor="#14191d", linewidth=1.4, label="a job can reach this"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     figure.suptitle(one.title, x=0.01, ha="left", fontsize=13, fontweight="bold")
     figure.draw_without_rendering()
     for axes in grid.flat:
-        _fit(axes)
+        _fit_axes(axes)
     figure.savefig(path, dpi=110)
 
 
 def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
     from matplotlib.patches import Rectangle
 
-    cells = one.of(panel)
+    cells = one.panel_cells(panel)
     xs, ys = (list(dict.fromkeys(getattr(cell, axis) for cell in cells)) for axis in ("x", "y"))
     for cell in cells:
         at = xs.index(cell.x), ys.index(cell.y)
         fill, ink = COLOURS[cell.outcome]
-        framed = cell.reached and one.is_divided
+        framed = cell.reached and one.is_partly_reachable
         edge: dict[str, Any] = {"edgecolor": "#14191d", "linewidth": 1.4} if framed else {"linewidth": 0}
         axes.add_patch(Rectangle((at[0] - 0.46, at[1] - 0.46), 0.92, 0.92, facecolor=fill, **edge))
         axes.text(*at, cell.text, ha="center", va="center", color=ink)
     axes.set(xlim=(-0.5, len(xs) - 0.5), ylim=(-0.5, len(ys) - 0.5))
-    axes.set_xticks(range(len(xs)), [_wrapped(x) for x in xs], fontsize=8)
-    axes.set_yticks(range(len(ys)), [_wrapped(y) for y in ys], fontsize=8)
+    axes.set_xticks(range(len(xs)), [_wrap_label(x) for x in xs], fontsize=8)
+    axes.set_yticks(range(len(ys)), [_wrap_label(y) for y in ys], fontsize=8)
     axes.set_xlabel(one.x, fontsize=9)
     axes.set_ylabel(one.y, fontsize=9)
     axes.set_title(panel, loc="left", fontsize=10)
@@ -135,7 +135,7 @@ def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
         )
 
 
-def _fit(axes: Any) -> None:
+def _fit_axes(axes: Any) -> None:
     """Shrink the numbers to fit their cells, or omit them."""
     left, right = axes.get_xlim()
     room = 0.88 * axes.get_window_extent().width / max(1.0, right - left)
@@ -148,5 +148,5 @@ def _fit(axes: Any) -> None:
             text.set_visible(False)
 
 
-def _wrapped(value: float | str) -> str:
+def _wrap_label(value: float | str) -> str:
     return textwrap.fill(format_tick(value), _TICK_LETTERS, break_long_words=False)

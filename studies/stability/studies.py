@@ -21,7 +21,7 @@ Values = Sequence[Any]  # values on an axis of a map
 ALL_HANDS: Final = ("allegro", "barrett", "shadow")  # hands for effects of different drives
 
 
-def run(
+def run_studies(
     names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, work: ExecutionContext, say: Say
 ) -> list[StabilityMap]:
     """Return the maps of the named studies; `say` receives a line per cell."""
@@ -30,7 +30,7 @@ def run(
     def few(values: Sequence[float]) -> Sequence[float]:
         return values[1::2] if quick else values
 
-    def beside(names: Sequence[str]) -> list[HandModel]:
+    def hands_to_compare(names: Sequence[str]) -> list[HandModel]:
         return [model] if quick else [model, *(hand_from_path(name) for name in names if name != model.name)]
 
     options = MapOptions(4 if quick else 8, "draft" if quick else "standard", work, say)
@@ -40,7 +40,7 @@ def run(
 
     def scene(name: str, xs: Values, ys: Values, few: tuple[Values, Values]) -> Callable[[], StabilityMap]:
         return lambda: scenes.scene_map(
-            name, beside(OTHER_HANDS), in_scenes, xs=few[0] if quick else xs, ys=few[1] if quick else ys
+            name, hands_to_compare(OTHER_HANDS), in_scenes, xs=few[0] if quick else xs, ys=few[1] if quick else ys
         )
 
     lengths = descents.LENGTHS[:1] if quick else (*descents.LENGTHS, *((descents.LONG,) if long else ()))
@@ -74,7 +74,7 @@ def run(
             couplings=("each joint",) if quick else assets.COUPLINGS,
         ),
         "model_errors": lambda: model_errors.model_error_map(
-            beside(ALL_HANDS), thing, few_errors, every=3 if quick else 1
+            hands_to_compare(ALL_HANDS), thing, few_errors, every=3 if quick else 1
         ),
         "baselines": lambda: baseline_map(
             model, options, methods=METHODS[:2] if quick else METHODS, shapes={"cube": (60,)} if quick else SHAPES

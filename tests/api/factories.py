@@ -12,8 +12,8 @@ from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import job_id
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.metrics import Axis
-from graspd.service.model.planning import PlannedTask, message_of, plan_tasks
+from graspd.service.model.metrics import PerturbedParameter
+from graspd.service.model.planning import PlannedTask, create_task_message, plan_tasks
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.transforms import pose_to_matrix
@@ -21,7 +21,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.columns import Attribute
 from graspd.service.store.library import publish_builtins
-from graspd.service.store.manifests import ShardManifest, manifest_of, publish_shard
+from graspd.service.store.manifests import ShardManifest, create_manifest, publish_shard
 from graspd.service.store.records import put_record
 from graspd.service.store.shards import check_columns, read_shard, write_shard
 from tests.fakes import beat_of, fail_task
@@ -66,8 +66,8 @@ def publish(
     """A task's shard of these columns, in the store and in the index."""
     kind = names.SHARD_KINDS[task.stage]
     data = write_shard(kind, arrays, attributes)
-    message = message_of(record, task, attempt=1, max_attempt=3)
-    manifest = manifest_of(
+    message = create_task_message(record, task, attempt=1, max_attempt=3)
+    manifest = create_manifest(
         message, data, arrays, attributes, check_columns(kind, arrays), device="cpu", seconds=12.5, worker="worker-1"
     )
     publish_shard(services.store, manifest, data)
@@ -148,12 +148,12 @@ def _base(random: np.random.Generator, count: int, request: JobRequest) -> Array
     if request.validation == "none":
         return arrays | {"quality/feasible": np.ones(count, np.uint8), "quality/valid": np.zeros(count, np.uint8)}
     arrays["quality/success"] = arrays["quality/valid"].astype(np.int8)
-    if request.models:
+    if request.model_count:
         held = arrays["quality/success"] == 1
-        share = kinds.integers(0, request.models + 1, count) / request.models
-        weakest = kinds.integers(1, len(Axis), count).astype(np.uint8)
+        share = kinds.integers(0, request.model_count + 1, count) / request.model_count
+        weakest = kinds.integers(1, len(PerturbedParameter), count).astype(np.uint8)
         arrays["quality/robust_share"] = np.where(held, share, np.nan)
-        arrays["quality/robust_weakest"] = np.where(held & (share < 1), weakest, np.uint8(Axis.NONE))
+        arrays["quality/robust_weakest"] = np.where(held & (share < 1), weakest, np.uint8(PerturbedParameter.NONE))
     return arrays
 
 

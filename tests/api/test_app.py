@@ -18,13 +18,13 @@ from starlette.responses import StreamingResponse
 from starlette.testclient import TestClient
 
 from graspd.api.app import create_app
-from graspd.api.metrics import Metrics, Snapshot
+from graspd.api.metrics import Metrics, MetricsSnapshot
 from graspd.service.index.rebuild import rebuild
 from graspd.service.model.errors import IndexUnavailable, QueueUnavailable, StoreUnavailable
 from graspd.service.model.series import SERIES
 from graspd.service.pipeline.backends import Services
 from graspd.service.queue.port import QueueStatus
-from graspd.service.run.address import bind
+from graspd.service.run.address import bind_socket
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from tests.api.conftest import BASE_URL
@@ -55,7 +55,7 @@ def test_answers_are_sent_without_delay() -> None:
             found.set_result(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
             writer.close()
 
-        async with await asyncio.start_server(accepted, sock=bind("127.0.0.1", 0)) as server:
+        async with await asyncio.start_server(accepted, sock=bind_socket("127.0.0.1", 0)) as server:
             _, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
             value = await found
             writer.close()
@@ -67,7 +67,7 @@ def test_answers_are_sent_without_delay() -> None:
 
 def test_workers_are_counted_in_every_state_that_they_can_be_in() -> None:
     """An alert on workers in quarantine asks for this very series; none is 0 and not absent."""
-    snapshot = Snapshot()
+    snapshot = MetricsSnapshot()
     beats = [beat_of(str(i), state=state) for i, state in enumerate(["idle", "quarantined", "quarantined"])]
     snapshot.add_queue(QueueStatus(workers={beat.name: (beat, 0.1) for beat in beats}), is_kept=True)
     text = Metrics().render(snapshot).decode()

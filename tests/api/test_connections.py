@@ -15,7 +15,7 @@ from graspd.api.app import create_app
 from graspd.api.catalog import events
 from graspd.api.server import TimedProtocol, configuration
 from graspd.service.pipeline.backends import Services
-from graspd.service.run.address import bind
+from graspd.service.run.address import bind_socket
 from graspd.service.settings import Settings
 from tests.api.factories import add_job
 from tests.waiting import PATIENCE_S, until
@@ -53,7 +53,7 @@ def connect(settings: Settings) -> Iterator[Connect]:
         config = configuration(app, settings)
         assert config.http is TimedProtocol
         config.http = _Quick
-        listener = bind("127.0.0.1", 0)
+        listener = bind_socket("127.0.0.1", 0)
         listener.listen()
         connection = socket.create_connection(listener.getsockname(), timeout=PATIENCE_S)
         opened.append(connection)

@@ -15,7 +15,7 @@ from graspd.baselines.dfc.method import DISTANCE, Descent, sample_starts
 from graspd.baselines.graspd2022 import kernels as graspd2022
 from graspd.baselines.graspd2022 import method
 from graspd.baselines.graspd2022.method import Search as GridSearch
-from graspd.baselines.graspd2022.method import _Batch, distance_grid, physics_of
+from graspd.baselines.graspd2022.method import _Batch, distance_grid, force_model
 from graspd.baselines.graspit import kernels as graspit
 from graspd.baselines.graspit.kernels import FIRST_STEP
 from graspd.baselines.graspit.method import EACH, ON_PALM, Search, eigengrasps
@@ -39,7 +39,7 @@ def descent_of(pivot: tuple[float, float, float] = (0.0, 0.0, -0.2), q: tuple[fl
 def evaluated(found: Descent, pivot: tuple[float, float, float], q: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
     found.proposal.set_state(HandState(np.array([pivot]), np.array([[1.0, 0, 0, 0]]), np.array([q])))
     found.new_terms.zero_()
-    for _, launch in found.launches.named()[1:-2]:
+    for _, launch in found.launches.named_commands()[1:-2]:
         launch.launch()
     return found.new_terms.numpy()[0].astype(float)
 
@@ -153,7 +153,7 @@ def _schedule(step_in: float, uniform_in: float, rise_in: float, out: wp.array[w
 def _evaluated(
     problem: graspit.Problem, state: graspit.vec8, p: wp.array2d[wp.vec3], q: wp.array2d[wp.quat], out: wp.array[float]
 ):
-    graspit.place(problem, 0, state, p, q)
+    graspit.pose_bodies(problem, 0, state, p, q)
     out[0] = graspit.contact_energy(problem, 0, p, q)
 
 
@@ -335,7 +335,7 @@ def probed(points: np.ndarray, velocity: tuple[float, ...] = (0, 0, 0), grid=Non
     """Distance, force and slope at points by a grid, by default of the sphere."""
     found = wp.zeros((3, len(points)), dtype=wp.vec3, device="cpu")
     at = wp.array(points, dtype=wp.vec3, device="cpu")
-    given = [physics_of(SPHERE.gyration_radius), grid or grid_of_sphere(CELLS), at, wp.vec3(*velocity)]
+    given = [force_model(SPHERE.gyration_radius), grid or grid_of_sphere(CELLS), at, wp.vec3(*velocity)]
     wp.launch(_probe, len(points), inputs=given, outputs=[found], device="cpu")
     distance, force, slope = found.numpy()
     return distance[:, 0], force, slope
@@ -402,13 +402,13 @@ def settled(pull: float) -> tuple[np.ndarray, np.ndarray]:
     """Relaxed forces (N, 3, 3) under a constant pull of the task on x, and the contact forces (N, 3, 3)."""
     batch = touching_batch()
     batch.pull.assign([[graspd2022.vec6(pull, 0, 0, 0, 0, 0)] * 3])
-    launches = dict(batch.launches.named())
+    launches = dict(batch.launches.named_commands())
     launches["forward"].launch()
     for _ in range(800):
         launches["relax"].launch()
     model, data = batch.model, batch.data
-    body, place = model.point_body.numpy(), data.body_p.numpy()[0]
-    points = place[body] + model.point_position.numpy()
+    body, pose_bodies = model.point_body.numpy(), data.body_p.numpy()[0]
+    points = pose_bodies[body] + model.point_position.numpy()
     forces = [probed(points, tuple(v), batch.grid)[1] for v in batch.velocity.numpy()]
     return batch.force.numpy()[0], np.stack(forces, axis=1)
 

@@ -11,7 +11,7 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 
-from graspd.service.run.address import bind
+from graspd.service.run.address import bind_socket
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from tests.api.conftest import app, furnished, services, settings
@@ -30,7 +30,7 @@ SHOWN_MS = 1000 * PATIENCE_S
 
 @contextmanager
 def serving(app: Any) -> Iterator[str]:
-    with bind("127.0.0.1", 0) as listener:
+    with bind_socket("127.0.0.1", 0) as listener:
         server = uvicorn.Server(uvicorn.Config(app, log_level="critical", timeout_graceful_shutdown=1))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()

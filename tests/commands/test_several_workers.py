@@ -46,7 +46,7 @@ def test_each_has_a_number_and_one_that_ends_comes_again(tmp_path: Path) -> None
 
 _ENDING = """
 import atexit
-from graspd.worker.process.engine import end
+from graspd.worker.process.engine import exit_process
 
 class Engine:
     def __del__(self):
@@ -54,7 +54,7 @@ class Engine:
 
 engine = Engine()
 atexit.register(print, "what waited was sent", flush=True)
-end()
+exit_process()
 """
 
 

@@ -267,7 +267,7 @@ def test_a_worker_makes_room_before_its_pod_is_killed_for_memory() -> None:
 
 def options_of(command: str) -> set[str]:
     module = next(module for name, module, *_ in graspd.cli.COMMANDS if name == command)
-    loaded: Any = graspd.cli.load(module, command)
+    loaded: Any = graspd.cli.load_command(module, command)
     return {option for parameter in loaded.params for option in parameter.opts}
 
 

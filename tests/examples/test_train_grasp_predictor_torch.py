@@ -26,8 +26,8 @@ def test_what_torch_learns_is_what_the_planner_runs() -> None:
     points, normals = rng.normal(0, 0.05, (32, 3)), rng.normal(size=(32, 3))
     inputs, anchor = net.cloud_inputs(points, normals, -0.1)
     noise = rng.standard_normal((5, 24)).astype(np.float32)
-    condition = net.conditions(file, inputs[None], np.array([anchor[2] + 0.1]))
-    found = net.flow(file, noise, np.repeat(condition, 5, axis=0))
+    condition = net.flow_conditions(file, inputs[None], np.array([anchor[2] + 0.1]))
+    found = net.integrate_flow(file, noise, np.repeat(condition, 5, axis=0))
     with torch.no_grad():
         seen = made.seen(torch.from_numpy(inputs)[None], torch.tensor([anchor[2] + 0.1], dtype=torch.float32))
         x = torch.from_numpy(noise)

@@ -286,7 +286,7 @@ def test_archives_are_neither_unpickled_nor_believed(tmp_path: Path, monkeypatch
 def test_what_shows_no_scene_or_no_clear_grasp_is_told(on_tables: Path, tmp_path: Path, monkeypatch) -> None:
     assert "no picture shows" in refused("export --format dexgraspnet2 -o", tmp_path / "out", on_tables / "block.h5")
     none = PictureReference(0, "base", "views", 0, np.eye(4), IDENTITY_POSE, np.zeros(0, np.intp))
-    monkeypatch.setattr(dexgraspnet2, "by_scene", lambda pictures: [[none]])
+    monkeypatch.setattr(dexgraspnet2, "group_by_scene", lambda pictures: [[none]])
     lots = [SimpleNamespace(id="base")]
     with pytest.raises(InputError, match="no grasp is valid and clear"):
         dexgraspnet2.write(lots, None, tmp_path, frozenset())
@@ -314,12 +314,12 @@ def test_pixels_of_the_object_take_what_is_nearest() -> None:
     surface = np.array([[-0.005, -0.0025, 0.0], [0.0, -0.0025, 0.0]])
     scene = SceneGraspness(surface, np.array([0]), np.array([1.0, 0.25]))
     ahead = np.array([0, 0, 0.5, 1, 0, 0, 0])
-    values = scene.of_view(depth, labels, K, np.eye(4), ahead)
+    values = scene.picture_graspness(depth, labels, K, np.eye(4), ahead)
     # Row by row: two of the object, its neighbour, table; the object again, a hole, which is no point, and table.
     assert values.shape == (7, 1)
     np.testing.assert_allclose(values[:, 0], [1, 0.25, 0, 0, 1, 0, 0])
     # An object that stands 13 cm from where the picture shows it is out of reach.
-    assert not scene.of_view(depth, labels, K, np.eye(4), ahead + np.array([0, 0, 0.13, 0, 0, 0, 0])).any()
+    assert not scene.picture_graspness(depth, labels, K, np.eye(4), ahead + np.array([0, 0, 0.13, 0, 0, 0, 0])).any()
 
 
 def test_a_hand_looks_between_its_thumb_and_its_fingers(hand, grasps: GraspSet) -> None:

@@ -35,7 +35,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, apply, invert, pose_to_matrix
 from graspd.service.readers import Pictures, open_shards
 from graspd.service.readers.clouds import COLUMNS
-from graspd.service.readers.depth_noise import noise_of
+from graspd.service.readers.depth_noise import parse_depth_noise
 from graspd.service.store import validity
 from graspd.worker.hands.kinematics import body_poses
 from tests.worker.commands_run import graspd, refused
@@ -162,9 +162,9 @@ def test_a_cloud_of_a_free_object_lies_on_it_where_it_is_itself(on_tables: Path,
     seen = [look for look in pictures_without_pixels(pictures) if look.base != "a" * 64]
     assert len(seen) == 4
     for look in seen:
-        points = dexlearn.points_of(pictures, look, None, on_table=False)
+        points = dexlearn.object_points(pictures, look, None, on_table=False)
         assert np.abs(trimesh.proximity.closest_point(mesh, points)[1]).max() < POINT_M
-        noisy = dexlearn.points_of(pictures, look, noise_of("stereo"), on_table=False)
+        noisy = dexlearn.object_points(pictures, look, parse_depth_noise("stereo"), on_table=False)
         # A camera is off by some tenths of a millimetre and more, and has holes.
         assert 1e-4 < np.abs(trimesh.proximity.closest_point(mesh, noisy)[1]).max() < 0.05
 

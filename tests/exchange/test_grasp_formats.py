@@ -15,24 +15,24 @@ from scipy.spatial.transform import Rotation
 
 from graspd.client.dataset_commands import read_spec
 from graspd.commands.exchange import read_sets
-from graspd.commands.studies import _read as read_study
+from graspd.commands.studies import _read_mapping as read_study
 from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, published, replicator, webdataset
-from graspd.exchange.bench_hand import _read as read_mapping
+from graspd.exchange.bench_hand import _read_mapping as read_mapping
 from graspd.exchange.bench_scene import object_of_scene, save_record
 from graspd.exchange.imported import Origin, joints_by_name, load_npy, parse_verdicts, scaled_object
 from graspd.exchange.inputs import expand_path, load_case
-from graspd.exchange.published import friction
+from graspd.exchange.published import stored_friction
 from graspd.exchange.scoring import write_scored
 from graspd.service.model.errors import InputError
-from graspd.service.model.studies import from_json
+from graspd.service.model.studies import parse_stability
 from graspd.service.model.transforms import compose, quat_to_matrix
 from graspd.service.readers import Pictures, Shards, open_shards
 from graspd.service.readers.trajectories import scene_spec_of
 from graspd.service.settings import Settings
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.service.store.store import open_store
-from graspd.studies.cards.contents import Contents, with_provenance
-from graspd.worker.files.provenance import options_of, scenes_of_shard
+from graspd.studies.cards.contents import Contents, add_provenance
+from graspd.worker.files.provenance import parse_options_attribute, scenes_of_shard
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.rendering.annotate import box_corners
 from tests.api import factories
@@ -253,7 +253,7 @@ REFUSED = {
     "is no Barrett hand": lambda at: published.read_ddgc(ddgc(at), hand="allegro", obj="block", number=1),
     "no grasp of 'a' on 'cup'": lambda at: published.read_multidex(at, robot="a", object_name="cup", **GIVEN),
     "q has 3 numbers": lambda at: published.read_multidex(at, robot="a", object_name="mug", **GIVEN),
-    "no file of reference grasps: it .* object": lambda at: friction(listed(at)),
+    "no file of reference grasps: it .* object": lambda at: stored_friction(listed(at)),
     "no record of GraspGen: it .* object": lambda at: graspgen.read(listed(at), **GIVEN),
     "joint 'row', which is a key": lambda at: dexgraspnet2._write_grasps(None, ROW_OF, at, None),
     "has no joint 'elbow'": lambda at: joints_by_name(HAND, ["elbow"], [[0.0]], what="x"),
@@ -294,10 +294,10 @@ def test_an_export_does_not_write_over_another(format_: str, on_tables: Path, tm
     [
         ("spec.json", read_spec),
         ("spec.toml", read_spec),
-        ("reference.json", friction),
+        ("reference.json", stored_friction),
         ("hand_mapping.json", read_mapping),
-        ("stability.json", lambda path: read_study(path, "stability", from_json)),
-        ("provenance.json", lambda path: with_provenance(Contents.__new__(Contents), path)),
+        ("stability.json", lambda path: read_study(path, "stability", parse_stability)),
+        ("provenance.json", lambda path: add_provenance(Contents.__new__(Contents), path)),
     ],
 )
 def test_a_file_that_is_nested_deep_is_refused_in_one_line(name: str, reader, tmp_path) -> None:
@@ -309,7 +309,7 @@ def test_a_file_that_is_nested_deep_is_refused_in_one_line(name: str, reader, tm
 
 
 def test_an_attribute_that_is_nested_deep_says_nothing() -> None:
-    assert options_of(DEEP) == {}
+    assert parse_options_attribute(DEEP) == {}
 
 
 H, W = 24, 32
@@ -393,4 +393,4 @@ def test_every_picture_is_one_sample_with_its_grasps(tmp_path) -> None:
     np.testing.assert_allclose(record["grasps"]["hand_pose"], expected["grasp/hand_pose"])
     assert record["grasp_frame"] == "camera"
     with pytest.raises(InputError, match="no picture"):
-        webdataset.write(Shards(shards.of("base")), tmp_path / "none")
+        webdataset.write(Shards(shards.of_kind("base")), tmp_path / "none")

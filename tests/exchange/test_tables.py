@@ -111,7 +111,7 @@ def test_what_is_no_table_of_grasps_is_told(folder: Path, tmp_path: Path, monkey
 
 def test_grasps_of_another_kind_of_scene_are_refused(folder: Path, tmp_path: Path) -> None:
     rows = [row | {"scene_kind": "bin"} for row in rows_of(folder, "grasps", "block")]
-    pq.write_table(parquet.arrow().Table.from_pylist(rows), tmp_path / "x.parquet")
+    pq.write_table(parquet.import_pyarrow().Table.from_pylist(rows), tmp_path / "x.parquet")
     with pytest.raises(InputError, match="kind 'bin'; only table and free"):
         huggingface.read(tmp_path / "x.parquet", hand="barrett", obj="block")
 

@@ -209,8 +209,8 @@ def test_completion_knows_commands_without_the_engine(typed: str, offered: str) 
 
 
 def commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(command, graspd.cli.Deferred):
-        command = graspd.cli.load(command.module, path.rpartition(" ")[2])
+    if isinstance(command, graspd.cli.DeferredCommand):
+        command = graspd.cli.load_command(command.module, path.rpartition(" ")[2])
     yield path, command
     for name, inner in getattr(command, "commands", {}).items():
         yield from commands(inner, f"{path} {name}")
@@ -221,7 +221,7 @@ def every() -> dict[str, Any]:
     return {
         path: one
         for name, module, _, _ in graspd.cli.COMMANDS
-        for path, one in commands(graspd.cli.load(module, name), f"graspd {name}")
+        for path, one in commands(graspd.cli.load_command(module, name), f"graspd {name}")
     }
 
 

@@ -6,7 +6,7 @@ import re
 import pytest
 import typer
 
-from graspd.cli import COMMANDS, build_app, load
+from graspd.cli import COMMANDS, build_app, load_command
 from graspd.service.settings import Settings
 from graspd.service.store.columns import ATTRIBUTES, SCHEMAS
 from tests.conftest import PACKAGES, REPOSITORY
@@ -36,7 +36,7 @@ def names() -> dict[str, set[str]]:
     found["column"] = {path for columns in SCHEMAS.values() for path in columns} | set(ATTRIBUTES)
     root = typer.Context(typer.main.get_command(build_app()))
     for name, module in {row[0]: row[1] for row in COMMANDS}.items():
-        commands = [load(module, name, root)]
+        commands = [load_command(module, name, root)]
         while commands:
             command = commands.pop()
             commands += (getattr(command, "commands", None) or {}).values()

@@ -10,13 +10,13 @@ import trimesh
 
 import graspd
 from benchmarks.large_index import fill
-from graspd.service.command_options import parsed_options
+from graspd.service.command_options import validate_options
 from graspd.service.docs import STUB, keywords_stub
 from graspd.service.index.index import Index
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import InputError
 from graspd.service.model.local_options import LocalOptions
-from graspd.service.model.options import rows
+from graspd.service.model.options import option_rows
 from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.one_more_row import FLAG, MEANING, NAME, OPTION, TITLE
@@ -39,7 +39,7 @@ from tests.shell import completed
 )
 def test_every_message_is_in_the_words_of_the_caller(wrong: dict[str, Any], typed: str, called: str) -> None:
     with pytest.raises(InputError) as refused:
-        parsed_options(LocalOptions, wrong)
+        validate_options(LocalOptions, wrong)
     assert str(refused.value).startswith(typed)
     with pytest.raises(InputError) as refused:
         graspd.synthesize("barrett", "block", **wrong)
@@ -59,7 +59,7 @@ def test_a_keyword_that_is_none_is_a_type_error() -> None:
 
 
 def test_fields_of_jobs_options_and_types_of_keywords_are_the_same() -> None:
-    assert {row.name for row in rows(JobRequest, "job")} == set(JobOptions.model_fields)
+    assert {row.name for row in option_rows(JobRequest, "job")} == set(JobOptions.model_fields)
     assert (REPOSITORY / STUB).read_text() == keywords_stub(), "run: make docs"
 
 

@@ -14,7 +14,7 @@ from graspd.service import user_cache
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    user_cache._root.cache_clear()
+    user_cache._cache_root.cache_clear()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
 
 

@@ -21,7 +21,7 @@ from graspd.cli import build_app
 from graspd.service.model import names
 from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import BANDS, SECTORS, evenness
-from graspd.service.model.planning import message_of, plan_tasks
+from graspd.service.model.planning import create_task_message, plan_tasks
 from graspd.service.model.records import JobRecord, Snapshot
 from graspd.service.model.states import Stage
 from graspd.service.model.transforms import quat_from_axis_angle
@@ -35,14 +35,14 @@ from graspd.service.store.records import read_record
 from graspd.service.store.shards import json_attribute, read_shard
 from graspd.studies.cards import contents as card_contents
 from graspd.studies.cards.card import write_card
-from graspd.studies.cards.contents import AssetFacts, Contents, contents_of_folder, contents_of_store, with_provenance
+from graspd.studies.cards.contents import AssetFacts, Contents, add_provenance, contents_of_folder, contents_of_store
 from graspd.studies.cards.findings import findings
 from graspd.studies.cards.numbers import card_content, share
 from graspd.studies.cards.page import render_card, yaml_head
 from graspd.studies.cards.plots import draw
 from graspd.studies.cards.tally import CellTally, JointUse, Tally, cell_counts, elevations, tally_of
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.stages.context import Output, shard_of
+from graspd.worker.stages.context import Output, build_shard
 from tests.api import factories
 from tests.fakes import fail_task, plan_all
 from tests.indexes import open_services
@@ -130,7 +130,7 @@ def dataset(folder: Path, change: Any = None, fails: Any = None, grasps: int = 4
 
 def _finish(services, record: JobRecord, change: Any) -> None:
     request, base = record.request, dict[str, Array]()
-    place = {"scene": json_attribute(request.place.model_dump(mode="json"))} if request.in_scene else {}
+    place = {"scene": json_attribute(request.scene_spec.model_dump(mode="json"))} if request.in_scene else {}
     for task in plan_tasks(record):
         rng = np.random.default_rng([task.batch, *map(ord, request.hand + request.object)])
         if task.stage is Stage.SYNTHESIZE:
@@ -161,8 +161,8 @@ def _finish(services, record: JobRecord, change: Any) -> None:
             output = Output(columns, place or {"base_shard": task.inputs[0]})
         else:
             output = Output(factories._views(rng, task.count, request), {"scene_shard": task.inputs[0], **place})
-        message = message_of(record, task, attempt=1, max_attempt=3)
-        manifest, data = shard_of(message, output, device="cpu", seconds=SECONDS[task.stage], worker="w1")
+        message = create_task_message(record, task, attempt=1, max_attempt=3)
+        manifest, data = build_shard(message, output, device="cpu", seconds=SECONDS[task.stage], worker="w1")
         publish_shard(services.store, manifest, data)
         services.index.write.add_manifests([manifest])
 
@@ -219,7 +219,7 @@ def test_what_a_folder_does_not_know_is_said_to_be_missing(export: Path, tmp_pat
 
 
 def test_pictures_without_their_grasps_have_no_card(kitchen: Case, tmp_path: Path) -> None:
-    pictures = replace(kitchen.contents, shards=Shards(kitchen.contents.shards.of("views")))
+    pictures = replace(kitchen.contents, shards=Shards(kitchen.contents.shards.of_kind("views")))
     with pytest.raises(InputError, match="has no base shard"):
         write_card(pictures, tmp_path, progress=no_progress)
 
@@ -227,7 +227,7 @@ def test_pictures_without_their_grasps_have_no_card(kitchen: Case, tmp_path: Pat
 def test_licences_can_be_given_for_what_was_added_without(kitchen: Case, tmp_path: Path) -> None:
     said = tmp_path / "assets.json"
     said.write_text(json.dumps({"objects": {"*": {"licence": "CC0-1.0"}, "mug": {"source": "a potter"}}}))
-    objects = with_provenance(kitchen.contents, said).objects
+    objects = add_provenance(kitchen.contents, said).objects
     assert (objects["block"].licence, objects["mug"].licence) == ("CC0-1.0", "Apache-2.0")
     assert objects["mug"].source == "a potter"
 
@@ -244,7 +244,7 @@ def test_a_file_of_licences_that_cannot_be_used_is_told(kitchen: Case, tmp_path:
     said = tmp_path / "assets.json"
     said.write_text(text)
     with pytest.raises(InputError, match=words):
-        with_provenance(kitchen.contents, said)
+        add_provenance(kitchen.contents, said)
 
 
 def test_a_cell_that_failed_is_told_with_its_reason(tmp_path: Path) -> None:
@@ -332,7 +332,7 @@ def test_counts_costs_and_clearance_are_those_of_the_dataset(kitchen: Case) -> N
     assert making["seconds_per_1000_valid"] == pytest.approx(1000 * batches * 4.0 / 160)
     assert making["synthesis_parts"] == {"planner": batches * 1.0}
     clear = pairs = 0
-    for file in kitchen.contents.shards.of("scene"):
+    for file in kitchen.contents.shards.of_kind("scene"):
         scene = read_shard(kitchen.contents.shards.path(file))
         pairs += int((scene["grasp/valid"] == 1).sum())
         clear += len(set(scene["grasp/base_index"][scene["grasp/valid"] == 1].tolist()))
@@ -346,7 +346,7 @@ def test_counts_costs_and_clearance_are_those_of_the_dataset(kitchen: Case) -> N
 
 @pytest.mark.parametrize("name", ["epsilon", "penetration_depth_mm"])
 def test_distributions_are_those_of_the_readers(kitchen: Case, name: str) -> None:
-    values = Grasps(kitchen.contents.shards.only(hands=["allegro"])).arrays(f"quality/{name}")[f"quality/{name}"]
+    values = Grasps(kitchen.contents.shards.select(hands=["allegro"])).arrays(f"quality/{name}")[f"quality/{name}"]
     values = values[:, 1] if values.ndim == 2 else values  # the threshold of 5 mm
     found = kitchen.card["quality"]["allegro"][name]
     assert kitchen.card["contact_threshold_m"] == 0.005
@@ -452,7 +452,7 @@ def test_cells_of_sphere_are_equal_and_one_direction_is_one_cell() -> None:
 
 
 def test_the_use_of_a_joint_is_a_share_of_its_limits() -> None:
-    use = JointUse.of(("a", "b"), {"lower": {"a": -1.0}, "upper": {"a": 1.0}})
+    use = JointUse.from_hand_facts(("a", "b"), {"lower": {"a": -1.0}, "upper": {"a": 1.0}})
     use.add(("a", "b"), np.stack([np.linspace(-0.5, 0.5, 1001), np.zeros(1001)], axis=1))
     (found,) = use.shares().values()
     # bins are 1/200 of the range

@@ -20,12 +20,12 @@ from graspd.studies.chart.figure import Label, place_labels
 from graspd.studies.chart.report import markdown
 from graspd.studies.chart.scenes import lift_figures
 from graspd.studies.chart.scenes import summarise_runs as summed_in_scenes
-from graspd.studies.chart.statistics import METRICS, first_valid, summarise_runs
-from graspd.studies.chart.sweeps import KnobValue, _make, knob_values, query_per_velocity
+from graspd.studies.chart.statistics import METRICS, seconds_to_valid, summarise_runs
+from graspd.studies.chart.sweeps import KnobValue, _plan_value, knob_values, query_per_velocity
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.quality.intervals import wilson
+from graspd.worker.quality.intervals import wilson_interval
 from tests.worker.commands_run import graspd, refused
 
 RUN_KEYS = {"method", "fidelity", "hand", "object", "valid_per_second", "seconds_to_first_valid", "gsr", "epsilon"}
@@ -117,8 +117,8 @@ def test_the_first_valid_grasp_takes_the_calls_of_a_coin() -> None:
     """Against 20,000 simulated waits; standard error below 1 %."""
     share, grasps = 0.3, 2
     waits = np.random.default_rng(1).geometric(1 - (1 - share) ** grasps, size=20_000)
-    assert first_valid(share, [1.5, 9.0, 1.4], grasps) == pytest.approx(1.5 * waits.mean(), rel=0.02)
-    assert first_valid(0.0, [1.5], grasps) is None
+    assert seconds_to_valid(share, [1.5, 9.0, 1.4], grasps) == pytest.approx(1.5 * waits.mean(), rel=0.02)
+    assert seconds_to_valid(0.0, [1.5], grasps) is None
 
 
 def run_of(method: str, valid: int, seconds: float, pd: float) -> dict:
@@ -155,7 +155,7 @@ def test_a_ratio_to_a_method_without_a_valid_grasp_is_a_bound() -> None:
 def test_each_knob_has_its_default_once_and_can_be_turned_alone() -> None:
     found = knob_values()
     for knob in {turn.knob for turn in found}:
-        assert sum(turn.default for turn in found if turn.knob == knob) == 1
+        assert sum(turn.is_default for turn in found if turn.knob == knob) == 1
     assert [turn.value for turn in knob_values(knobs=["queries"])] == ["shared", "one per velocity"]
 
 
@@ -163,7 +163,7 @@ def test_asking_for_distances_anew_changes_no_grasp() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block")
     little = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 12, "fine_iterations": 5})
     shared, anew = (
-        _make(hand, obj, 2, 0, turn=KnobValue("queries", "", little, change), run=ExecutionContext(threads=1))
+        _plan_value(hand, obj, 2, 0, turn=KnobValue("queries", "", little, change), run=ExecutionContext(threads=1))
         for change in (None, query_per_velocity)
     )
     np.testing.assert_array_equal(shared.grasp.hand_pose, anew.grasp.hand_pose)
@@ -274,7 +274,9 @@ def test_gain_is_median_of_pairs_in_which_filtering_found_any() -> None:
     inside, outside = summed_in_scenes(runs)
     assert inside["gain"] == pytest.approx((4 / 1 + 4 / 2) / 2)
     assert (inside["pairs_with_one"], outside["pairs_with_one"]) == (3, 2)
-    assert inside["robust"] == 0.5 and (inside["robust_low"], inside["robust_high"]) == pytest.approx(wilson(12, 24))
+    assert inside["robust"] == 0.5 and (inside["robust_low"], inside["robust_high"]) == pytest.approx(
+        wilson_interval(12, 24)
+    )
     assert outside["seconds_to_first"] is None and inside["seconds_to_first"] == 2.0
     assert inside["lift"] == 0.8 and outside["valid_per_second"] == pytest.approx(1.0)
 

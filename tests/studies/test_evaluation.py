@@ -22,8 +22,8 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.transforms import apply, invert
 from graspd.service.store.shards import write_shard
-from graspd.studies.bench import clock_of, host_ms, kernel_shares
-from graspd.studies.evaluation import combine, evaluate
+from graspd.studies.bench import clock_of, kernel_shares, measure_host_ms
+from graspd.studies.evaluation import combine_rows, evaluate
 from graspd.worker.control.postures import pregrasp, squeeze
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.generation import validated_grasps
@@ -78,7 +78,7 @@ def test_what_holds_is_validated_in_other_models_when_asked(tmp_path) -> None:
     assert sum(one["share"] * one["n"] for one in axes.values()) == pytest.approx(6 * row["robust_share"], abs=1e-4)
     assert [(one["robust_weakest"] is None) for one in row["verdicts"]] == [share in (None, 1.0) for share in shares]
     json.dumps(row, allow_nan=False)
-    whole = combine([row, {**row, "robust_n": 4, "robust_share": 0.0}])
+    whole = combine_rows([row, {**row, "robust_n": 4, "robust_share": 0.0}])
     assert whole["robust_share"] == pytest.approx(row["robust_share"] / 3, abs=1e-6)
     assert whole["robust_axes"] == {axis: {"share": one["share"], "n": 2 * one["n"]} for axis, one in axes.items()}
     assert "robust_share" not in evaluate(plates_case(), cache=tmp_path)
@@ -89,24 +89,24 @@ def test_published_results_agree_where_they_are_known(tmp_path) -> None:
     assert row["gsr"] is None and row["sd_cm"] < 1.0
     row = evaluate(plates_case(published=np.array([1, 0, -1], np.int8)), cache=tmp_path)
     assert row["agreement_published"] == 0.5
-    whole = combine([row, {**row, "agreement_published": 0.0, "published": 6}])
+    whole = combine_rows([row, {**row, "agreement_published": 0.0, "published": 6}])
     assert whole["agreement_published"] == pytest.approx((2 * 0.5 + 6 * 0.0) / 8)
 
 
 def test_several_objects_are_weighed_and_seconds_add_up(tmp_path) -> None:
     row = evaluate(plates_case(), cache=tmp_path)
-    whole = combine([row, {**row, "n": 1, "gsr": 0.0, "osr": 0.0}])
+    whole = combine_rows([row, {**row, "n": 1, "gsr": 0.0, "osr": 0.0}])
     assert (whole["n"], whole["gsr"], whole["osr"]) == (4, pytest.approx(0.5), 0.5)
     timed = {**row, "sgs": 1.0, "sgs_without_validation": 2.0}
-    whole = combine([timed, {**timed, "sgs": 0.5, "sgs_without_validation": 1.0}])
+    whole = combine_rows([timed, {**timed, "sgs": 0.5, "sgs_without_validation": 1.0}])
     # Two held grasps in 2 s and two in 4 s; without the validator in 1 s and in 2 s.
     assert (whole["sgs"], whole["sgs_without_validation"]) == pytest.approx((4 / 6, 4 / 3))
     validated = evaluate(plates_case(seconds=1.0, validated=True), cache=tmp_path)
     assert (validated["sgs"], validated["sgs_without_validation"]) == (pytest.approx(2.0), None)
-    whole = combine([row, {**row, "mu": 0.5}])
+    whole = combine_rows([row, {**row, "mu": 0.5}])
     assert whole["mu"] is None and "clear_share" not in whole
     clear = [{**row, "clear_share": 1.0}, {**row, "n": 1, "clear_share": 0.0}]
-    assert combine(clear)["clear_share"] == pytest.approx(row["n"] / (row["n"] + 1))
+    assert combine_rows(clear)["clear_share"] == pytest.approx(row["n"] / (row["n"] + 1))
     assert whole["level"] == "standard"
 
 
@@ -175,7 +175,7 @@ def test_every_run_has_the_keys_of_the_contract_and_adds_up(tmp_path) -> None:
 
 def test_kernels_are_no_time_of_the_host_and_their_shares_add_up() -> None:
     hand, obj, fidelity, count = hand_from_path("barrett"), object_from_path("block"), FIDELITIES["draft"], 16
-    host = host_ms(hand, obj, fidelity, count)
+    host = measure_host_ms(hand, obj, fidelity, count)
     began = time.thread_time()
     plan(hand, obj, PlanRequest(count, fidelity, seed=0), ExecutionContext("cpu", threads=1))
     assert host < 0.5 * 1e3 * (time.thread_time() - began) / count
@@ -197,7 +197,7 @@ def test_unknown_fidelities_and_no_networks_are_told(tmp_path, capsys: pytest.Ca
 
 def test_a_study_plans_the_grasps_of_a_job() -> None:
     wish = JobOptions(want="candidates", fidelity="draft", seed=5, rechecks=0)
-    hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=wish.knobs.face_error_m)
+    hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=wish.resolved_fidelity.face_error_m)
     made = validated_grasps(hand, obj, wish, count=2).grasps
     found = planned(hand, obj, count=2, seed=5, fidelity="draft")
     assert np.array_equal(found.grasp.hand_pose, made.grasp.hand_pose)

@@ -15,9 +15,9 @@ from graspd.commands.synth import _format_summary
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
-from graspd.service.model.metrics import Axis
+from graspd.service.model.metrics import PerturbedParameter
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.service.model.studies import MapCell, Stability, StabilityMap, from_json, grade
+from graspd.service.model.studies import MapCell, Stability, StabilityMap, grade, parse_stability
 from graspd.service.store.records import latest_record
 from graspd.service.store.store import open_store
 from graspd.studies.stability import assets, descents, gradients, integrators, scenes, studies
@@ -44,17 +44,17 @@ FEW = MapOptions(4)
 FRICTION, MASS = "friction, relative to the model", "mass, relative to the model"
 #: What of a variant stands for an error's amount.
 AMOUNTS = {
-    "collision shapes of the hand grown by [mm]": (Axis.SHAPES, lambda v: 1e3 * v.grown_m),
-    FRICTION: (Axis.FRICTION, lambda v: v.friction),
-    MASS: (Axis.MASS, lambda v: v.mass),
-    "gains, relative to the model": (Axis.JOINTS, lambda v: v.gain),
-    "armature [1e-4 kg m²]": (Axis.JOINTS, lambda v: 1e4 * (v.armature or 0.0)),
-    "dry friction of joints [N m]": (Axis.JOINTS, lambda v: v.dry_friction or 0.0),
-    "object displaced by [mm]": (Axis.POSE, lambda v: 1e3 * np.linalg.norm(v.object_shift_m)),
-    "object rotated by [°]": (Axis.POSE, lambda v: np.degrees(np.linalg.norm(v.object_turn))),
-    "hand displaced by [mm]": (Axis.CALIBRATION, lambda v: 1e3 * np.linalg.norm(v.hand_shift_m)),
-    "centre of mass displaced by [mm]": (Axis.CENTRE, lambda v: 1e3 * np.linalg.norm(v.centre_m)),
-    "last finger delayed by [share of closing]": (Axis.ORDER, lambda v: max(v.lags)),
+    "collision shapes of the hand grown by [mm]": (PerturbedParameter.SHAPES, lambda v: 1e3 * v.grown_m),
+    FRICTION: (PerturbedParameter.FRICTION, lambda v: v.friction),
+    MASS: (PerturbedParameter.MASS, lambda v: v.mass),
+    "gains, relative to the model": (PerturbedParameter.JOINTS, lambda v: v.gain),
+    "armature [1e-4 kg m²]": (PerturbedParameter.JOINTS, lambda v: 1e4 * (v.armature or 0.0)),
+    "dry friction of joints [N m]": (PerturbedParameter.JOINTS, lambda v: v.dry_friction or 0.0),
+    "object displaced by [mm]": (PerturbedParameter.POSE, lambda v: 1e3 * np.linalg.norm(v.object_shift_m)),
+    "object rotated by [°]": (PerturbedParameter.POSE, lambda v: np.degrees(np.linalg.norm(v.object_turn))),
+    "hand displaced by [mm]": (PerturbedParameter.CALIBRATION, lambda v: 1e3 * np.linalg.norm(v.hand_shift_m)),
+    "centre of mass displaced by [mm]": (PerturbedParameter.CENTRE, lambda v: 1e3 * np.linalg.norm(v.centre_m)),
+    "last finger delayed by [share of closing]": (PerturbedParameter.ORDER, lambda v: max(v.lags)),
 }
 
 
@@ -72,7 +72,7 @@ def pair(hand: HandModel) -> Pair:
 @pytest.mark.parametrize("name", ["direct (default)", "Gauss-Seidel, one sweep", "Jacobi, averaged"])
 def test_planners_own_step_lies_where_its_integrators_are_good(name: str) -> None:
     way = LossOptions().step  # time step x speed [m]
-    energy, sunk = integrators.position_based(integrators.SOLVERS[name], dt=1e-3, speed=way / 1e-3)
+    energy, sunk = integrators.simulate_position_based(integrators.SOLVERS[name], dt=1e-3, speed=way / 1e-3)
     assert grade(energy, *integrators.ENERGY) == grade(sunk, *integrators.SINK_M) == "good"
 
 
@@ -80,7 +80,7 @@ def test_planners_own_step_lies_where_its_integrators_are_good(name: str) -> Non
 def test_a_penalty_force_blows_up_above_the_bound_of_theory(share: float, holds: bool) -> None:
     stiffness, mass = 1e5, 1.0
     bound = 2 * math.sqrt(mass / stiffness)  # of semi-implicit Euler on one spring
-    energy, _ = integrators.force_based(dt=share * bound, speed=0.05, stiffness=stiffness, mass=mass)
+    energy, _ = integrators.simulate_force_based(dt=share * bound, speed=0.05, stiffness=stiffness, mass=mass)
     assert (energy < integrators.ENERGY[1]) is holds
 
 
@@ -128,7 +128,7 @@ def test_a_long_run_does_not_drift(pair: Pair) -> None:
 def test_a_quick_run_takes_less_than_the_minute_that_it_promises() -> None:
     started = time.process_time()
     options = {"quick": True, "long": False, "work": DEFAULT_CONTEXT, "say": lambda line: None}
-    found = studies.run(STUDIES, "allegro", "block", **options)
+    found = studies.run_studies(STUDIES, "allegro", "block", **options)
     assert time.process_time() - started < 60  # CPU seconds: others may keep the machine busy
     assert [one.name for one in found] == list(STUDIES) and all(one.cells for one in found)
 
@@ -291,6 +291,6 @@ def test_maps_of_several_runs_are_drawn_and_published_as_one(tmp_path) -> None:
     graspd("stability --publish", *given, "--out", tmp_path / "out", "--data-dir", tmp_path)
     written = json.loads((tmp_path / "out" / "stability.json").read_text())
     assert latest_record(open_store((tmp_path / "store").as_uri()), "stability") == written
-    found = from_json(written)
+    found = parse_stability(written)
     assert {one.name: one.title for one in found.maps} == {"shared": "second", "first": "first", "second": "second"}
     assert found.command == "graspd stability first; graspd stability second"

@@ -154,7 +154,7 @@ def test_random_kills_lose_nothing_and_repeat_nothing(
 
 def submitted(system: System, grasps: int, *, span: int) -> str:
     """A job in bulk whose tasks have so many batches."""
-    record = job_actions.prepare(system.services, wanted(grasps=grasps), priority=Priority.BULK)
+    record = job_actions.prepare_job(system.services, wanted(grasps=grasps), priority=Priority.BULK)
     return job_actions.enter_job(system.services, record.model_copy(update={"span": span}))[0].id
 
 

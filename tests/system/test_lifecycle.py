@@ -77,10 +77,10 @@ def test_somebody_at_a_screen_does_not_wait_for_a_dataset(start: Start) -> None:
     bulk = job_actions.submit(system.services, request(grasps=100_000), priority=Priority.BULK)[0].id
     system.until(lambda: system.services.index.jobs.get(bulk).grasps, "the dataset runs")
     system.hold.touch()
-    system.until(lambda: len(system.services.queue.waiting()) >= _WAITING, "the dataset fills the queue")
+    system.until(lambda: len(system.services.queue.waiting_tasks()) >= _WAITING, "the dataset fills the queue")
     job = system.submit(request(grasps=32, seed=1))
     (task,) = system.services.index.jobs.tasks(job=job).items
-    system.until(lambda: task.id in system.services.queue.waiting(), "the small job waits too")
+    system.until(lambda: task.id in system.services.queue.waiting_tasks(), "the small job waits too")
     released = timestamp()
     system.hold.unlink()
     (done,) = system.finish(job)
@@ -159,7 +159,7 @@ def test_an_index_killed_in_the_middle_is_caught_up_with(start: Start, own_postg
     system.finish(system.submit(request(seed=1)))
     system.hold.touch()
     job = system.submit(request(grasps=32 * 20))
-    system.until(lambda: len(system.services.queue.waiting()) >= 4, "more waits than the one that runs")
+    system.until(lambda: len(system.services.queue.waiting_tasks()) >= 4, "more waits than the one that runs")
     own_postgres.kill()
     made = len(list(system.services.store.list("shards")))
     system.hold.unlink()

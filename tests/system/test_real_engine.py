@@ -53,10 +53,10 @@ def test_a_worker_killed_in_mid_synthesis_leaves_the_same_grasps(start: Callable
     assert [attempt.kind for attempt in attempts] == ["WorkerLost"]
     (shard,) = index.shards.page(job=job, kind="base").items
     kept = read_shard(system.services.store.get(shard.key))
-    block = object_from_path("block", face_error_m=request.knobs.face_error_m)
+    block = object_from_path("block", face_error_m=request.resolved_fidelity.face_error_m)
     scenes = None
     if request.in_scene:
-        scenes, poses = scenes_of(request.place, block, [], count=request.scenes, seed=request.seed)
+        scenes, poses = scenes_of(request.scene_spec, block, [], count=request.scenes, seed=request.seed)
         np.testing.assert_array_equal(kept["scene/object_pose"], poses["scene/object_pose"])
     undisturbed = validated_grasps(hand_from_path("barrett"), block, request, count=24, scenes=scenes).grasps
     np.testing.assert_array_equal(kept["grasp/hand_pose"], undisturbed.grasp.hand_pose)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from graspd.service.model.cores import available_cores
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import InputError, TaskCancelled
-from graspd.service.model.metrics import MIN_DISTANCE_M, Axis
+from graspd.service.model.metrics import MIN_DISTANCE_M, PerturbedParameter
 from graspd.service.store.columns import SCHEMAS, check_attributes
 from graspd.worker import generation
 from graspd.worker.execution_context import ExecutionContext
@@ -22,7 +22,7 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PlanRequest
-from graspd.worker.quality.diversity import distances, hand_points
+from graspd.worker.quality.diversity import grasp_distances, hand_points
 from graspd.worker.rounds import next_round, select_rows
 from graspd.worker.validation.protocol import Outcome
 from graspd.worker.validation.robust import Robustness
@@ -120,7 +120,7 @@ def test_a_grasp_like_one_that_is_kept_makes_room_for_another(hand, monkeypatch)
     found = validated_grasps(hand, BLOCK, wish(**plain), count=COUNT)
     points = hand_points(hand, found.grasps.grasp)
     rows, others = np.triu_indices(len(points), 1)
-    assert len(found.grasps) == COUNT and distances(points, rows, others).min() >= MIN_DISTANCE_M
+    assert len(found.grasps) == COUNT and grasp_distances(points, rows, others).min() >= MIN_DISTANCE_M
     assert found.rejected["alike"] >= COUNT - 1
     assert validated_grasps(hand, BLOCK, wish(**plain, min_distance=0), count=COUNT).rejected["alike"] == 0
 
@@ -204,7 +204,7 @@ def test_only_grasps_that_hold_in_enough_models_count(hand) -> None:
 def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, monkeypatch) -> None:
     def nowhere(*args, held: np.ndarray, models: int, wanted: float, **kwargs) -> Robustness:
         verdicts = np.where(held[:, None], 0, -1).astype(np.int8) * np.ones((1, models), np.int8)
-        return Robustness(verdicts, np.full(verdicts.shape, Axis.POSE, np.uint8), wanted, 0.0)
+        return Robustness(verdicts, np.full(verdicts.shape, PerturbedParameter.POSE, np.uint8), wanted, 0.0)
 
     monkeypatch.setattr(generation, "validate_robustness", nowhere)
     none = validated_grasps(hand, BLOCK, wish(robust=0.5, budget=1, rechecks=0), count=4)
@@ -212,14 +212,14 @@ def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, monkeypat
     raw = validated_grasps(hand, BLOCK, wish(robust=0.5, want="candidates", rechecks=0), count=4)
     held = raw.columns["quality/success"] == 1
     assert (raw.columns["quality/robust_share"][held] == 0).all() and len(raw.grasps) == 4
-    assert (raw.columns["quality/robust_weakest"][held] == Axis.POSE).all()
+    assert (raw.columns["quality/robust_weakest"][held] == PerturbedParameter.POSE).all()
     assert raw.columns["quality/valid"].any(), "a grasp that is not robust is valid all the same"
 
 
 def test_a_part_fills_its_share_and_a_quiet_one_can_be_stopped() -> None:
     told: list[tuple[float, float, str]] = []
     run = ExecutionContext("cuda:7", 3, lambda *what: told.append(what), lambda: True)
-    part = run.part(0.5, 1.0).part(0.0, 0.5)
+    part = run.with_progress_range(0.5, 1.0).with_progress_range(0.0, 0.5)
     part.progress(1, 2, "half")
     part.progress(5, 5, "whole")
     part.progress(0, 0, "of nothing")

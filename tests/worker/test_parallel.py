@@ -21,9 +21,9 @@ from graspd.worker.batched_generation import validated_batches
 from graspd.worker.engines.batch_sizes import (
     BYTES_PER_PROCESS,
     PROCESS_SHARE,
-    batches_at_once,
+    batches_per_launch,
     batches_that_fit,
-    processes_at_once,
+    pool_process_count,
 )
 from graspd.worker.execution_context import CoreSharing, ExecutionContext, parallel_map
 from graspd.worker.files.synthesis import synthesize_grasps
@@ -46,7 +46,7 @@ COUNT = 2 * SMALLEST_PART
 
 @pytest.fixture(scope="module")
 def pair():
-    return hand_from_path("barrett"), object_from_path("block", face_error_m=REQUEST.knobs.face_error_m)
+    return hand_from_path("barrett"), object_from_path("block", face_error_m=REQUEST.resolved_fidelity.face_error_m)
 
 
 @pytest.fixture(scope="module")
@@ -292,7 +292,7 @@ def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:
 
 
 def test_how_many_are_joined_where_nobody_says() -> None:
-    assert batches_at_once("cpu", None) == 1 and batches_at_once("cpu", 4) == 4
+    assert batches_per_launch("cpu", None) == 1 and batches_per_launch("cpu", 4) == 4
     # Of an H100 and an H200 (132 multiprocessors), of a GPU with 20, and of one whose memory is nearly full.
     assert [
         batches_that_fit(132, 80 << 30),
@@ -396,10 +396,10 @@ def test_how_many_there_are_where_nobody_says(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 1 << 26}[name])
     room = round(BYTES_PER_PROCESS / PROCESS_SHARE)
     big = machine(tmp_path / "big", 16, 40 * room)
-    assert processes_at_once("cuda:0", 0, root=big) == 15
-    assert processes_at_once("cuda:1", 0, root=big, workers=4) == 3, "workers of one machine share its cores"
-    assert processes_at_once("cuda:0", 0, root=big, threads=5) == 4
-    assert processes_at_once("cpu", 0, root=big) == 1, "the planner takes the cores at other times"
-    assert [processes_at_once(device, 6, root=big) for device in ("cpu", "cuda:0")] == [6, 6]
-    assert processes_at_once("cuda:0", 0, root=machine(tmp_path / "two", 2, 40 * room)) == 1
-    assert processes_at_once("cuda:0", 0, root=machine(tmp_path / "poor", 16, 3 * room)) == 3
+    assert pool_process_count("cuda:0", 0, root=big) == 15
+    assert pool_process_count("cuda:1", 0, root=big, workers=4) == 3, "workers of one machine share its cores"
+    assert pool_process_count("cuda:0", 0, root=big, threads=5) == 4
+    assert pool_process_count("cpu", 0, root=big) == 1, "the planner takes the cores at other times"
+    assert [pool_process_count(device, 6, root=big) for device in ("cpu", "cuda:0")] == [6, 6]
+    assert pool_process_count("cuda:0", 0, root=machine(tmp_path / "two", 2, 40 * room)) == 1
+    assert pool_process_count("cuda:0", 0, root=machine(tmp_path / "poor", 16, 3 * room)) == 3

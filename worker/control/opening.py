@@ -80,11 +80,11 @@ class Openings:
         with wp.ScopedDevice(posing.device):
             self.fingers = _fingers(posing.hand)
             self.hands = opening.Hands()
-            self.hands.position, self.hands.rotation = posing.roots(hand_pose)
+            self.hands.position, self.hands.rotation = posing.upload_roots(hand_pose)
             self.hands.q = wp.array(q, dtype=wp.float64)
             self.open = wp.array(q if wide is None else wide, dtype=wp.float64)
             self.step = wp.zeros(1, dtype=wp.int32)
-        self.bodies = posing.bodies(self.count)
+        self.bodies = posing.allocate_bodies(self.count)
 
     def open_from(self, grasp: Posture) -> None:
         """Open each finger from `grasp` until it is `CLEARANCE_M` from the object, or as far as possible."""
@@ -94,7 +94,7 @@ class Openings:
         self._launch(opening.open_against_closing, self.count, [self.fingers, STUCK_M, first], [plain, self.step])
         self._step(plain)
         inputs = [self.fingers, self.hands, STUCK_M, first, plain]
-        self._launch(opening.take_opening, self.open.shape, inputs, [self.open])
+        self._launch(opening.write_opening, self.open.shape, inputs, [self.open])
 
     def without_jams(self, blocked: Blocked | None = None) -> Floats:
         """Return the open dofs (N, D); fingers that jam or are `blocked` open less far or not at all.
@@ -110,7 +110,7 @@ class Openings:
                 jams.blocked.assign(self._blocked(jams, blocked))
             less = wp.float64(0.5 if look < JAM_LOOKS - 1 else 0.0)
             self._launch(jamming.shorten_paths, self.count, [less], [jams])
-        self._launch(jamming.take_path, self.open.shape, [self.fingers, self.hands, jams], [self.open])
+        self._launch(jamming.write_path, self.open.shape, [self.fingers, self.hands, jams], [self.open])
         return np.array(self.open.numpy())
 
     def retreated(self) -> Floats:
@@ -128,7 +128,7 @@ class Openings:
         for step, way in enumerate(RETREATS_M):
             inputs = [*points, approach, PALM_CLEARANCE_M, wp.float64(way), self.bodies]
             self._launch(jamming.hand_clearance, (self.count, posing.lanes), inputs, [back])
-            self._launch(jamming.measure_retreat, self.count, [PALM_CLEARANCE_M, step], [back])
+            self._launch(jamming.select_retreat, self.count, [PALM_CLEARANCE_M, step], [back])
         poses = self.hand_pose.copy()
         away = np.array(RETREATS_M)[back.chosen.numpy()]
         poses[:, :3] -= away[:, None] * quat_rotate(poses[:, 3:], posing.hand.palm.approach)
@@ -148,7 +148,7 @@ class Openings:
 
     def _open_directions(self, grasp: Posture, sweep: Any) -> None:
         posing, hand = self.posing, self.posing.hand
-        bodies, near = posing.touch(grasp, CLEARANCE_M)
+        bodies, near = posing.nearest_points(grasp, CLEARANCE_M)
         with wp.ScopedDevice(posing.device):
             wrench = [wp.empty((self.count, hand.bodies), dtype=wp.vec3d) for _ in range(2)]
             away = wp.empty((self.count, hand.dofs), dtype=wp.float64)
@@ -163,7 +163,7 @@ class Openings:
         out.add(opening.place_opening, self.count, inputs=inputs, outputs=[sweep, self.bodies])
         inputs = [posing.probe.skin, posing.points, self.fingers, posing.lane, CLEARANCE_M, self.bodies]
         out.add(opening.finger_clearance, (self.count, posing.lanes), inputs=inputs, outputs=[sweep])
-        out.add(opening.measure_opening, self.count, inputs=[CLEARANCE_M, self.step], outputs=[sweep])
+        out.add(opening.select_opening, self.count, inputs=[CLEARANCE_M, self.step], outputs=[sweep])
         out.add(optimizers.advance, 1, inputs=[], outputs=[self.step])
         out.run(OPENING_STEPS + 1)
 

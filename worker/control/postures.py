@@ -70,7 +70,7 @@ def pregrasp(
     palm's approach until contact ends. The root rises where fingers would penetrate a support they may touch."""
     posing = posture_data_of(hand, obj, points=_POINTS, device=device)
     poses, joints = np.zeros((len(grasp), 7)), np.zeros((len(grasp), len(hand.joint_names)))
-    for rows in posing.parts(len(grasp)):
+    for rows in posing.row_slices(len(grasp)):
         some, scene = grasp.take(rows), placed.take(rows) if placed is not None else None
         opening = Openings(posing, some.hand_pose, hand.reduce(some.joint_positions))
         opening.open_from(some)
@@ -85,7 +85,7 @@ def wide_open_joints(hand: HandModel, obj: ObjectModel, pregrasp: Posture, place
     Fingers open against `HandModel.closing`, and stop before they touch one another or an obstacle."""
     posing = posture_data_of(hand, obj, points=_POINTS, device="cpu")
     joints = np.zeros((len(pregrasp), len(hand.joint_names)))
-    for rows in posing.parts(len(pregrasp)):
+    for rows in posing.row_slices(len(pregrasp)):
         some, scene = pregrasp.take(rows), placed.take(rows)
         q = hand.reduce(some.joint_positions)
         far = np.where(hand.closing > 0, hand.lower, np.where(hand.closing < 0, hand.upper, q))
@@ -123,7 +123,7 @@ def hold_forces(
     posing = posture_data_of(hand, obj, points=_POINTS, device=device)
     total, reach = normal_force(obj) if total_normal_force is None else total_normal_force, (PRESSING_M, closing)
     found = HoldForces(np.ones(len(grasp)), np.zeros((len(grasp), hand.dofs)))
-    for rows in posing.parts(len(grasp)):
+    for rows in posing.row_slices(len(grasp)):
         residual, torque = balance_forces(posing, grasp.take(rows), total, friction, reach, MAX_PRESSING)
         found.residual[rows], found.torque[rows] = residual, torque
     return found
@@ -136,7 +136,7 @@ def normal_force(obj: ObjectModel) -> float:
 
 def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.int32]:
     """Return the number (N,) of the hand's bodies in contact, by the rule of the geometric gate."""
-    return posture_data_of(hand, obj, points=_POINTS, device=device).touching_links(grasp)
+    return posture_data_of(hand, obj, points=_POINTS, device=device).count_touching_links(grasp)
 
 
 def fingers_off_object(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.bool_]:

@@ -43,7 +43,7 @@ def balance_forces(
     Normal forces sum to `total` [N]. If a torque exceeds its limit, all forces are scaled down together, which keeps
     the balance. Points press within the first distance of `reach` [m]; on a finger without such points, within the
     second distance. At most `most` of these points are used, far apart from each other."""
-    bodies, near = posing.touch(grasp, max(reach))
+    bodies, near = posing.nearest_points(grasp, max(reach))
     count, points, radius = len(grasp), len(posing.probe.points), posing.probe.obj.radius
     rows = int(touching.FIRST_TORQUE) + posing.hand.dofs
     with wp.ScopedDevice(posing.device):
@@ -52,11 +52,11 @@ def balance_forces(
         chosen, used = wp.empty((count, most), dtype=wp.int32), wp.empty(count, dtype=wp.int32)
         places = [wp.float64(FACING_COS), wp.float64(radius)]
         inputs = [posing.points, posing.finger, near, *reach, *places]
-        launch(touching.choose, count, inputs=inputs, outputs=[touches, *scratch, chosen, used])
+        launch(touching.choose_contacts, count, inputs=inputs, outputs=[touches, *scratch, chosen, used])
         matrix = wp.empty((count, most * int(touching.EDGES), rows), dtype=wp.float64)
         inputs = [posing.chain, posing.effort, posing.points, bodies, near, chosen, used]
         inputs += [wp.float64(friction), wp.float64(radius), wp.float64(SUM)]
-        launch(touching.columns, chosen.shape, inputs=inputs, outputs=[matrix])
+        launch(touching.balance_columns, chosen.shape, inputs=inputs, outputs=[matrix])
         unit = wp.empty(count, dtype=wp.float64)
         launch(touching.scale_torques, count, inputs=[wp.float64(TORQUE)], outputs=[used, matrix, unit])
         target = np.zeros(rows)
@@ -81,7 +81,7 @@ def solve_nonnegative(matrix: Any, target: Floats, ridge: float, count: Any) -> 
         x = wp.empty((batch, columns), dtype=wp.float64)
         feasible = wp.empty(batch, dtype=wp.int32)
         inputs = [matrix, wp.array(target, dtype=wp.float64), wp.float64(ridge), count]
-        launch(kernels.nonnegative, batch, inputs=inputs, outputs=[work, x, feasible])
+        launch(kernels.solve_nonnegative, batch, inputs=inputs, outputs=[work, x, feasible])
     unsolved = np.flatnonzero(feasible.numpy() == 0)
     if len(unsolved):
         found, columns, used = x.numpy(), matrix.numpy(), count.numpy()

@@ -69,7 +69,7 @@ def start_warp() -> None:
                 if _HARMLESS not in line:
                     os.write(2, line)
         _set_thread_defaults()
-        copy_compiled(Path(wp.config.kernel_cache_dir))
+        copy_compiled_kernels(Path(wp.config.kernel_cache_dir))
         _started = True
 
 
@@ -120,7 +120,7 @@ def compile_modules(
     return sorted(file for file in Path(wp.config.kernel_cache_dir).glob("*/*") if file.is_file())
 
 
-def copy_compiled(cache: Path) -> None:
+def copy_compiled_kernels(cache: Path) -> None:
     """Copy missing kernels from `$GRASPD_KERNELS` into the cache, if the folder is readable."""
     if not (named := os.environ.get(VARIABLE, "")):
         return
@@ -133,7 +133,7 @@ def copy_compiled(cache: Path) -> None:
         log.warning("kernels of %s are not used: %s", source, error)
 
 
-def binary_name(module: ModuleType) -> str:
+def binary_identity(module: ModuleType) -> str:
     """Return the identity of a module's kernels on this CPU; equal identities mean the same code."""
     known = wp.get_module(module.__name__)
     # A launch on the CPU has blocks of one thread.

@@ -20,7 +20,7 @@ BYTES_PER_PROCESS: Final = 400 * 2**20
 PROCESS_SHARE: Final = 0.25  # share of the machine's memory for these processes
 
 
-def batches_at_once(device: str, join: int | None) -> int:
+def batches_per_launch(device: str, join: int | None) -> int:
     """Return the batches per launch on a Warp device: `join` if given, else 1 on the CPU.
     On a GPU the default fills the GPU within its free memory."""
     if join is not None or not device.startswith("cuda"):
@@ -38,7 +38,7 @@ def batches_that_fit(multiprocessors: int, free_bytes: int) -> int:
     return 1 << (batches.bit_length() - 1)
 
 
-def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: int = 1, root: Path = ROOT) -> int:
+def pool_process_count(device: str, wanted: int, *, threads: int = 0, workers: int = 1, root: Path = ROOT) -> int:
     """Return how many processes validate and measure: `wanted` if not 0; 1 for the worker's threads alone.
     On a GPU the default is one less than the worker's share of the cores, within a quarter of the memory for all
     `workers`. On a CPU the planner needs all cores, so the default is 1."""

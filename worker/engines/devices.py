@@ -103,7 +103,7 @@ def select_gpu(gpus: Sequence[Gpu], folder: Path, *, number: int | None = None) 
         folder.mkdir(parents=True, exist_ok=True)
         for place in range(_MOST):
             for gpu in eligible:
-                if _lock(folder / f"{re.sub(r'[^A-Za-z0-9-]', '_', gpu.id)}.{place}.lock"):
+                if _try_lock(folder / f"{re.sub(r'[^A-Za-z0-9-]', '_', gpu.id)}.{place}.lock"):
                     if place:
                         log.info("%s (%s) is shared by %d processes", gpu.name, gpu.model, place + 1)
                     return gpu
@@ -112,7 +112,7 @@ def select_gpu(gpus: Sequence[Gpu], folder: Path, *, number: int | None = None) 
     return eligible[0]
 
 
-def _lock(file: Path) -> bool:
+def _try_lock(file: Path) -> bool:
     """Try to lock a file; return success. Raises OSError if locks are unavailable."""
     opened = file.open("ab")
     try:

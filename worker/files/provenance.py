@@ -131,7 +131,7 @@ def files_at(sought: AssetReference, path: Path) -> AssetFiles | None:
     return None
 
 
-def options_of(attribute: object) -> dict[str, Any]:
+def parse_options_attribute(attribute: object) -> dict[str, Any]:
     """Parse an attribute with a JSON object; empty if the attribute is absent or invalid."""
     try:
         said = from_json(str(attribute or "{}"))
@@ -170,7 +170,7 @@ def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
     said = shard.attributes
     # Older shards lack these attributes: the values were the same for all objects.
     mass, friction = (float(said.get(key, default)) for key, default in _MATTER.items())  # type: ignore[arg-type]
-    stated = options_of(said.get("fidelity")).get("face_error_m")
+    stated = parse_options_attribute(said.get("fidelity")).get("face_error_m")
     error = float(stated) if isinstance(stated, int | float) else 3e-4
     wanted = _reference_of(shard, AssetKind.OBJECT)
     if not given:
@@ -191,7 +191,7 @@ def _load_object(wanted: AssetReference, found: AssetFiles, face_error_m: float)
 def _reference_of(shard: Shard, kind: AssetKind) -> AssetReference:
     said = shard.attributes
     name, digest, source = (str(said.get(f"{kind.value}{part}", "")) for part in ("", "_digest", "_source"))
-    options = options_of(said.get(f"{kind.value}_options"))
+    options = parse_options_attribute(said.get(f"{kind.value}_options"))
     return AssetReference(kind, name, digest, source, options, _folder_of(shard))
 
 
@@ -306,11 +306,11 @@ def base_attributes(
     if outcomes:
         said["outcomes"] = json_attribute(dict(outcomes))
     if request.in_scene:
-        said |= {"scene": json_attribute(request.place.to_attribute())} | wrist_attributes(hand)
+        said |= {"scene": json_attribute(request.scene_spec.to_attribute())} | wrist_attributes(hand)
     if request.requirements:
         said["requirements"] = json_attribute(request.requirements)
-    if request.models:
-        said["robust"] = json_attribute({"models": request.models, "wanted": request.robust})
+    if request.model_count:
+        said["robust"] = json_attribute({"models": request.model_count, "wanted": request.robust})
     if verdict_key is None:
         return said | {"verdict_level": "none"}
     return said | {"verdict_level": request.validation, "verdict_key": verdict_key}

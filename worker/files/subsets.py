@@ -16,14 +16,14 @@ from graspd.service.cli import load_settings
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.readers import Shards, open_shards
 from graspd.service.store import validity
-from graspd.service.store.shards import Shard, part_of_shard, read_shard, relative_path_of
+from graspd.service.store.shards import Shard, read_shard, relative_path_of, shard_bytes_of_rows
 from graspd.service.store.store import open_store
 
 #: Function from the base shards of one hand on one object to a mask (N,) for each shard.
 Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
 
 
-def shards_of(source: str) -> Shards:
+def open_source(source: str) -> Shards:
     """Return the shards of a file or folder, or of a dataset in this machine's store by name.
     Raises NotFoundError: none of these exists."""
     if "/" in source or source in (".", "..") or Path(source).exists():
@@ -49,12 +49,12 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
     require_empty_folder(out)
     looked_at = kept = 0
     ready: list[tuple[PurePosixPath, bytes]] = []
-    for _, files in groupby(shards.of("base"), key=lambda file: (file.hand, file.object)):
+    for _, files in groupby(shards.of_kind("base"), key=lambda file: (file.hand, file.object)):
         together = [read_shard(shards.path(file), kind="base") for file in files]
         for shard, mask in zip(together, choose(together), strict=True):
             looked_at, kept = looked_at + len(mask), kept + int(mask.sum())
             if mask.any():
-                ready.append((relative_path_of(shard, {one for one, _ in ready}), part_of_shard(shard, mask)))
+                ready.append((relative_path_of(shard, {one for one, _ in ready}), shard_bytes_of_rows(shard, mask)))
     if not ready:
         raise InputError(f"none of {looked_at} grasps is selected")
     for path, data in ready:
@@ -62,7 +62,7 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
         (out / path).write_bytes(data)
     summary = {**said, "looked_at": looked_at, "kept": kept, "shards": [str(path) for path, _ in ready]}
     (out / "subset.json").write_text(json.dumps(summary, indent=1) + "\n")
-    passed_over = len(shards) - len(shards.of("base"))
+    passed_over = len(shards) - len(shards.of_kind("base"))
     return {"looked_at": looked_at, "kept": kept, "shards": len(ready), "passed_over": passed_over}
 
 

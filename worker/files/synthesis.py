@@ -24,7 +24,7 @@ from graspd.service.store.columns import Attribute
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
 from graspd.service.store.shards import json_attribute, read_shard
 from graspd.worker.batched_generation import validated_batches
-from graspd.worker.engines.batch_sizes import batches_at_once, processes_at_once
+from graspd.worker.engines.batch_sizes import batches_per_launch, pool_process_count
 from graspd.worker.engines.devices import Device
 from graspd.worker.execution_context import ExecutionContext, PrefilterMode, Progress
 from graspd.worker.files.provenance import (
@@ -45,8 +45,8 @@ from graspd.worker.planners import planner
 from graspd.worker.planners.registry import local_options
 from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.scenes.placement import scenes_of
-from graspd.worker.scenes.rest import rolling_poses
-from graspd.worker.validation.payload import Limit
+from graspd.worker.scenes.rest import count_rolling_poses
+from graspd.worker.validation.payload import PayloadLimit
 
 Arrays = dict[str, NDArray[Any]]
 FREE: Final = SceneSpec()
@@ -67,7 +67,7 @@ class SynthesisResult:
     place: SceneSpec
     interrupted: bool  # whether it was stopped early
     seconds: float  # wall time without loading of the files [s]
-    rolling: int = 0  # scenes in which the object may roll, see `rolling_poses`
+    rolling: int = 0  # scenes in which the object may roll, see `count_rolling_poses`
 
     @property
     def reason(self) -> str | None:
@@ -75,11 +75,11 @@ class SynthesisResult:
         request, count = self.request, len(self.arrays["quality/valid"])
         if self.interrupted:
             return f"interrupted: {count} of {request.grasps} grasps were finished"
-        limit, narrow = self.limit, self.narrow
+        limit, narrow = self.payload_limit, self.narrow_reason
         reason = explain_shortfall(
             count,
             request.grasps,
-            request.counted,
+            request.counted_status,
             sum(batch.candidates for batch in self.batches),
             request.budget,
             sum_outcomes(batch.outcomes for batch in self.batches),
@@ -90,12 +90,12 @@ class SynthesisResult:
         return f"{reason}; {narrow}" if reason and narrow else reason
 
     @property
-    def narrow(self) -> str | None:
+    def narrow_reason(self) -> str | None:
         """Return the geometric reason why no grasp is valid; None if it is unknown or a grasp is valid."""
         return None if self.arrays["quality/valid"].any() else self.batches[0].narrow
 
     @property
-    def limit(self) -> Limit | None:
+    def payload_limit(self) -> PayloadLimit | None:
         """Return the payload limit if it explains why no grasp was found."""
         return None if len(self.arrays["quality/valid"]) else self.batches[0].limit
 
@@ -124,19 +124,19 @@ class SynthesisResult:
         if request.shake:
             margin = self._finite_values("shake_margin")
             summary["shake_share"] = round(float((margin < 1).mean()), 4) if len(margin) else None
-        if self.limit is not None:
-            summary["limit"] = self.limit.facts()
+        if self.payload_limit is not None:
+            summary["limit"] = self.payload_limit.facts()
         summary |= self._diversity()
-        if request.models:
+        if request.model_count:
             summary |= {
-                "robust_models": request.models,
+                "robust_models": request.model_count,
                 "robust_wanted": request.robust,
                 "robust_share": self._mean("robust_share", 4),
                 "not_robust": sum(batch.rejected.get("not_robust", 0) for batch in self.batches),
             }
         if self.place.kind != "free":
             summary |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
-            summary |= {"rolling_scenes": self.rolling, "narrow": self.narrow}
+            summary |= {"rolling_scenes": self.rolling, "narrow": self.narrow_reason}
         return summary
 
     def _diversity(self) -> dict[str, Any]:
@@ -168,15 +168,15 @@ class SynthesisResult:
         }
 
 
-def synthesize_with(hand: str, obj: str, options: LocalOptions, **run: Any) -> SynthesisResult:
+def synthesize_with_options(hand: str, obj: str, options: LocalOptions, **run: Any) -> SynthesisResult:
     """Run `synthesize_grasps` with a local user's options; `run` are its further arguments."""
     return synthesize_grasps(
         hand,
         obj,
-        options.request(local_options(options.method, options.options), wrist_pose(str(options.like))),
-        place=options.place,
+        options.job_options(local_options(options.method, options.options), wrist_pose(str(options.like))),
+        place=options.scene_spec,
         scenes=options.scenes,
-        mesh=options.mesh,
+        mesh=options.mesh_options,
         device=options.device,
         threads=options.threads,
         join=None if options.join == "auto" else options.join,
@@ -217,14 +217,16 @@ def synthesize_grasps(
 ) -> SynthesisResult:
     """Make the grasps of a job in scene `place`; `hand` and `obj` are files or built-in names.
     `mesh` has options for the object's file. `join` batches are one launch of the planner; None fills a GPU.
-    `processes` validate and measure: 1 is this process alone, 0 stands for `processes_at_once`. Raises InputError: an
+    `processes` validate and measure: 1 is this process alone, 0 stands for `pool_process_count`. Raises InputError: an
     invalid argument, or a scene without space. TaskCancelled: cancelled; with `partial`, only before any validation."""
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
     if request.shake and place.kind == "free":
         raise InputError(SHAKE_NEEDS_A_SCENE)
     options = dict(mesh or {})
     model = hand_from_path(hand)
-    thing = apply_request(object_from_path(obj, face_error_m=request.knobs.face_error_m, options=options), request)
+    thing = apply_request(
+        object_from_path(obj, face_error_m=request.resolved_fidelity.face_error_m, options=options), request
+    )
     chosen = Device(device).resolve()
     began = time.perf_counter()
     others = [object_from_path(one.object, face_error_m=NEIGHBOUR_FACE_ERROR_M) for one in place.neighbours]
@@ -235,8 +237,8 @@ def synthesize_grasps(
     run = ExecutionContext(chosen, threads, prefilter=prefilter)
     run = run if progress is None else replace(run, progress=progress)
     run = run if cancelled is None else replace(run, cancelled=cancelled)
-    joined = batches_at_once(chosen, join)
-    count = processes_at_once(chosen, processes, threads=threads)
+    joined = batches_per_launch(chosen, join)
+    count = pool_process_count(chosen, processes, threads=threads)
     with Pool(count, MODULES) if count > 1 else nullcontext() as pool:
         if pool is not None:
             pool.start()  # while the first grasps are planned
@@ -254,7 +256,7 @@ def synthesize_grasps(
     if poses:
         attributes |= {"scene": json_attribute(_stored_scene(place, others))} | wrist_attributes(model)
         attributes |= neighbour_attributes(others, [one.object for one in place.neighbours])
-    rolling = rolling_poses(thing, poses["scene/object_pose"]) if poses and place.target is None else 0
+    rolling = count_rolling_poses(thing, poses["scene/object_pose"]) if poses and place.target is None else 0
     made = SynthesisResult(arrays, attributes, batches, request, place, interrupted, seconds, rolling)
     if made.reason is not None:
         attributes["reason"] = made.reason
@@ -278,7 +280,7 @@ def _attributes(
         "object": obj.name,
         "object_digest": obj.digest,
         "method": request.method,
-        "fidelity": json_attribute(request.knobs.model_dump(mode="json")),
+        "fidelity": json_attribute(request.resolved_fidelity.model_dump(mode="json")),
         "seed": request.seed,
         "batch": 0,
         "device": device,

@@ -43,7 +43,7 @@ BUDGET: Final = 8.0
 def contact_boxes(hand: HandModel, obj: ObjectModel, grasp: Posture) -> Floats:
     """Return the boxes (N, 2, 3) around all contacts of N grasps: corners in the object frame [m].
     Boxes of grasps without contact are nan."""
-    found = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=64).touch(grasp)
+    found = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=64).nearest_points(grasp)
     near = (np.abs(found.distance) < LINK_CONTACT_M)[..., None]
     low, high = (np.where(near, found.closest, sign * np.inf) for sign in (1, -1))
     boxes = np.stack([low.min(axis=1), high.max(axis=1)], axis=1)

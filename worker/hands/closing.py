@@ -41,12 +41,12 @@ def closing_by_tips(hand: HandModel) -> Floats:
     Joints parallel to a finger's last joint flex the finger, unless their limits are symmetric. They close in the
     direction that brings the tip to the other tips and to the palm. Other joints close if they bring the tip to the
     other tips and ahead, unless they turn about the approach or have symmetric limits."""
-    limits, (flexing, opposing, ways) = closing_by_limits(hand), _gains(hand)
+    limits, (flexing, opposing, ways) = closing_by_limits(hand), _fingertip_effects(hand)
     postures = (hand.expand(closing_posture(hand, share)) for share in (0.0, 0.5))
     opened, half = (quat_rotate(body_poses(hand, IDENTITY_POSE, q)[0, :, 3:], hand.axis) for q in postures)
     flexed, crossed, flexed_way, crossed_way = np.zeros((4, hand.dofs))
     seen = np.zeros(hand.dofs, bool)
-    for number, chain in enumerate(chains_of(hand)):
+    for number, chain in enumerate(finger_chains(hand)):
         dofs = hand.dof[chain]
         seen[dofs] = True
         moving = ways[dofs, number] > _MOVING * ways[dofs, number].max(initial=1e-9)
@@ -68,7 +68,7 @@ def closing_by_tips(hand: HandModel) -> Floats:
     return np.where(seen, np.where(flexed_way > 0, bends, opposes), limits)
 
 
-def _gains(hand: HandModel) -> tuple[Floats, Floats, Floats]:
+def _fingertip_effects(hand: HandModel) -> tuple[Floats, Floats, Floats]:
     """Measure the effect of each dof on each fingertip over the dof's range from lower to upper limit.
     Return three arrays (D, T) [m], summed over postures of the other dofs: decrease of the distances to the other tips
     and to the palm; decrease of the distance to the other tips, plus motion along the approach; the path's length."""
@@ -92,7 +92,7 @@ def _tip_distances(tip: Floats) -> Floats:
     return np.asarray(np.linalg.norm(tip - others, axis=1)) if len(tip) > 1 else np.zeros(1)
 
 
-def chains_of(hand: HandModel) -> list[list[int]]:
+def finger_chains(hand: HandModel) -> list[list[int]]:
     """Return the bodies whose joints move each fingertip, the last one first, up to the palm."""
     own = set(range(1, hand.bodies)) - set(shared_bodies(hand))
     return [[body for body in hand.chain(tip) if body in own] for tip in hand.fingertips]

@@ -15,7 +15,7 @@ from graspd.worker.objects.disk_cache import cached_step
 TOUCH_M = 1e-4
 
 
-def resting_neighbours(hand: HandModel) -> frozenset[tuple[int, int]]:
+def collision_exempt_pairs(hand: HandModel) -> frozenset[tuple[int, int]]:
     """Return pairs of bodies (a < b): parent or grandparent and child, and those that touch at rest.
     Rest means both the pre-shape and the middle of the limits: bodies that touch in both cannot be separated."""
     near = {(above, body) for body in range(1, hand.bodies) for above in [*hand.chain(body), 0][1:3]}

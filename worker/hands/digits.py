@@ -15,7 +15,7 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, JointType, SurfacePoints
-from graspd.worker.hands.pinch_postures import opposed_finger
+from graspd.worker.hands.pinch_postures import opposing_finger
 from graspd.worker.objects.memory_cache import cached_by_content
 
 #: Names of digits: the opposing one, then the others by increasing distance of their bases from its base.
@@ -42,7 +42,7 @@ def digit_names(hand: HandModel) -> tuple[str, ...]:
     count = len(hand.fingertips)
     if not 2 <= count <= len(NAMES) or jaws_of(hand) is not None:
         return ()
-    thumb = opposed_finger(hand)
+    thumb = opposing_finger(hand)
     base = np.array([_base(hand, tip) for tip in hand.fingertips])
     order = np.argsort(np.linalg.norm(base - base[thumb], axis=1), kind="stable")
     names = [""] * count

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, SurfacePoints
-from graspd.worker.hands.pinch_postures import Oppositions, improve_postures, opposed_finger, random_postures
+from graspd.worker.hands.pinch_postures import PinchPostures, improve_postures, opposing_finger, random_postures
 from graspd.worker.hands.surface import farthest_points, sample_surface
 from graspd.worker.objects.memory_cache import cached_by_content
 
@@ -43,34 +43,34 @@ FACING: Final = 0.8
 SQUARE: Final = 0.7
 
 
-def flat_pinches(hand: HandModel, height: float) -> Oppositions:
+def flat_pinches(hand: HandModel, height: float) -> PinchPostures:
     """Return postures for objects of a height [m]; none for one finger or objects as high as the pads.
     The component of the palm's approach perpendicular to `axis` points at the plane, half the height below `middle`."""
     known = [h for h in HEIGHTS_M if h >= height]
-    return _cached_pinches(hand, known[0]) if known and len(hand.fingertips) > 1 else Oppositions.empty(hand)
+    return _cached_pinches(hand, known[0]) if known and len(hand.fingertips) > 1 else PinchPostures.empty(hand)
 
 
 @cached_by_content(32)
-def _cached_pinches(hand: HandModel, height: float) -> Oppositions:
+def _cached_pinches(hand: HandModel, height: float) -> PinchPostures:
     key = (hand.content, str(height))
-    return Oppositions.cached("pinches", key, lambda: _pinches(hand, height), sys.modules[__name__])
+    return PinchPostures.load_or_search("pinches", key, lambda: _search_pinches(hand, height), sys.modules[__name__])
 
 
-def _pinches(hand: HandModel, height: float) -> Oppositions:
-    one, look = opposed_finger(hand), _PinchSearch(hand, height)
+def _search_pinches(hand: HandModel, height: float) -> PinchPostures:
+    one, look = opposing_finger(hand), _PinchSearch(hand, height)
     q = random_postures(hand, one, CROWD * POSTURES)
     wanted = np.linspace(*WIDTHS_M, POSTURES)
-    cost = look.at(q, one).cost(np.repeat(wanted, CROWD))
+    cost = look.evaluate(q, one).cost(np.repeat(wanted, CROWD))
     q = q[np.arange(POSTURES) * CROWD + cost.reshape(POSTURES, CROWD).argmin(axis=1)]
-    q = improve_postures(hand, one, q, lambda tried: look.at(tried, one).cost(wanted))
-    seen = look.at(q, one)
+    q = improve_postures(hand, one, q, lambda tried: look.evaluate(tried, one).cost(wanted))
+    seen = look.evaluate(q, one)
     faces = (seen.facing > FACING) & (seen.square < SQUARE)
     good = np.flatnonzero(faces & (seen.short < 1.0) & (seen.over > OVER_M) & (seen.width > WIDTHS_M[0]))
-    return Oppositions.of(q, seen, good if len(good) >= FEW else good[:0])
+    return PinchPostures.select(q, seen, good if len(good) >= FEW else good[:0])
 
 
 @dataclass(frozen=True)
-class _Evaluation:
+class _PinchQuality:
     """Pinches between the fingertips' ends in N postures, and their quality; root frame."""
 
     axis: Floats
@@ -99,14 +99,14 @@ class _PinchSearch:
     def __init__(self, hand: HandModel, height: float) -> None:
         self.hand, self.height = hand, height
         points = sample_surface(hand, _DENSE)
-        tips = [_spread(points, tip, _TIP_POINTS) for tip in hand.fingertips]
+        tips = [_spread_points(points, tip, _TIP_POINTS) for tip in hand.fingertips]
         mine = np.stack([np.resize(some, _TIP_POINTS) for some in tips])
         others = np.setdiff1d(points.body, hand.fingertips).tolist()
-        rest = np.concatenate([_spread(points, body, _OTHER_POINTS) for body in others])
+        rest = np.concatenate([_spread_points(points, body, _OTHER_POINTS) for body in others])
         self.tips, self.normals = points.position[mine], points.normal[mine]  # (F, V, 3) body frames [m]
         self.others, self.body = points.position[rest], points.body[rest].astype(np.intp)  # (W, 3), (W,)
 
-    def at(self, q: Floats, one: int) -> _Evaluation:
+    def evaluate(self, q: Floats, one: int) -> _PinchQuality:
         """Evaluate the pinch between the finger `one` and the others in postures (N, D)."""
         hand, others = self.hand, [f for f in range(len(self.tips)) if f != one]
         bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
@@ -142,10 +142,10 @@ class _PinchSearch:
             + np.einsum("ni,ni->n", end[:, one] + end[:, others].mean(axis=1), across)[:, None] * 0.5 * across
         )
         lowest = np.einsum("nvi,ni->nv", apply(bodies[:, self.body], self.others), down).max(axis=1)
-        return _Evaluation(axis, middle, width, short, facing, np.abs(axis @ hand.palm.approach), plane - lowest)
+        return _PinchQuality(axis, middle, width, short, facing, np.abs(axis @ hand.palm.approach), plane - lowest)
 
 
-def _spread(points: SurfacePoints, body: int, count: int) -> NDArray[np.intp]:
+def _spread_points(points: SurfacePoints, body: int, count: int) -> NDArray[np.intp]:
     mine = np.flatnonzero(points.body == body)
     return mine[farthest_points(points.position[mine], min(count, len(mine)))]
 

@@ -17,7 +17,7 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_r
 from graspd.worker.hands import digits
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
 from graspd.worker.hands.model import HandModel, SurfacePoints
-from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
+from graspd.worker.hands.pinch_postures import PinchPostures, pinch_postures_of
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.memory_cache import cached_by_content
 
@@ -62,17 +62,17 @@ _NEXT_TO: Final = 1e-9
 
 
 @cached_by_content(32)
-def postures_for_size(hand: HandModel, size: Size) -> Oppositions:
+def postures_for_size(hand: HandModel, size: Size) -> PinchPostures:
     """Return postures for small or wide objects, cached in memory and on disk."""
     key = (hand.content, size)
-    return Oppositions.cached("spans", key, lambda: _search_postures(hand, size), sys.modules[__name__])
+    return PinchPostures.load_or_search("spans", key, lambda: _search_postures(hand, size), sys.modules[__name__])
 
 
 @cached_by_content(16)
-def postures_between(hand: HandModel, first: NDArray[np.int32], second: NDArray[np.int32]) -> Oppositions:
+def postures_between(hand: HandModel, first: NDArray[np.int32], second: NDArray[np.int32]) -> PinchPostures:
     """Return postures in which two parts of a hand face each other, cached in memory and on disk.
     Each part is given by the `digits.Part` (L,) of each body."""
-    return Oppositions.cached(
+    return PinchPostures.load_or_search(
         "parts",
         (hand.content, str(first.tolist()), str(second.tolist())),
         lambda: _search_postures(hand, "small", (first, second)),
@@ -82,12 +82,12 @@ def postures_between(hand: HandModel, first: NDArray[np.int32], second: NDArray[
 
 
 def largest_width(hand: HandModel) -> float:
-    """Return an upper bound of the widths in `postures_for_size` [m], from `oppositions_of` alone."""
-    return WIDER * oppositions_of(hand).widest + GOOD_M
+    """Return an upper bound of the widths in `postures_for_size` [m], from `pinch_postures_of` alone."""
+    return WIDER * pinch_postures_of(hand).widest + GOOD_M
 
 
-def _search_postures(hand: HandModel, size: Size, parts: Parts | None = None) -> Oppositions:
-    widest = oppositions_of(hand).widest
+def _search_postures(hand: HandModel, size: Size, parts: Parts | None = None) -> PinchPostures:
+    widest = pinch_postures_of(hand).widest
     least, most = SMALL_M if size == "small" else (widest, WIDER * widest)
     if parts is not None:
         least, most = THINNEST_M, PART_WIDTH_M
@@ -104,12 +104,12 @@ def _search_postures(hand: HandModel, size: Size, parts: Parts | None = None) ->
         better = new.cost < found.cost
         q[better] = tried[better]
         found.take(better, new)
-    return Oppositions.of(q, found, np.flatnonzero(found.cost < GOOD_M))
+    return PinchPostures.select(q, found, np.flatnonzero(found.cost < GOOD_M))
 
 
 @dataclass
 class _BestPairs:
-    """Best pair of points in each of N postures: fields as in `Oppositions`, and costs (N,) [m]."""
+    """Best pair of points in each of N postures: fields as in `PinchPostures`, and costs (N,) [m]."""
 
     axis: Floats
     middle: Floats

@@ -12,7 +12,7 @@ from graspd.service.model.errors import HandError, did_you_mean
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_rotate
 from graspd.worker.hands import closing
 from graspd.worker.hands.closing import closing_posture, shared_bodies, tip_positions
-from graspd.worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, prismatic_dofs, sign_of
+from graspd.worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, dominant_sign, find_jaws, prismatic_dofs
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, PalmFrame
 from graspd.worker.hands.options import HandOptions
@@ -45,23 +45,23 @@ RIM_M = 0.02
 def complete_hand(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
     """Fill in fingertips, closing, palm and preshape of the hand: as stated, else as guessed."""
     hand = replace(hand, fingertips=_fingertips(hand, tree, options))
-    stated = dict(_by_dof(hand, tree, options.closing))
+    stated = dict(_values_by_dof(hand, tree, options.closing))
     hand = replace(hand, closing=closing.closing_by_limits(hand))
     slide = prismatic_dofs(hand)
     if hand.dofs <= MAX_DOFS or slide.any():
         seen = replace(hand, closing=_gripper_closing(hand, stated))
         if (jaws := find_jaws(seen)) is not None:
-            return _gripper(seen, jaws, tree, options)
+            return _complete_gripper(seen, jaws, tree, options)
         # Sliding dofs close in the direction that brings surfaces together.
         hand = replace(hand, closing=np.where(slide, seen.closing, hand.closing))
     for _ in range(LOOKS):
         hand = _with_palm(hand, tree, options)
         hand = replace(hand, closing=np.where(slide, hand.closing, closing.closing_by_tips(hand)))
     # A joint's stated closing does not change the guess for another joint.
-    return _with_palm(replace(hand, closing=_override(hand.closing, stated)), tree, options)
+    return _with_palm(replace(hand, closing=_with_stated_closing(hand.closing, stated)), tree, options)
 
 
-def _override(guessed: Floats, stated: Mapping[int, float]) -> Floats:
+def _with_stated_closing(guessed: Floats, stated: Mapping[int, float]) -> Floats:
     result = guessed.copy()
     for dof, direction in stated.items():
         result[dof] = np.sign(direction)
@@ -76,7 +76,7 @@ def _with_palm(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
     return replace(hand, palm=_palm(hand, tree, options, approach))
 
 
-def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> HandModel:
+def _complete_gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> HandModel:
     """Set up a gripper from its jaws: open on the approach, palm behind the point between the pads."""
     approach = _stated_approach(hand, tree, options)
     if approach is None:
@@ -117,7 +117,7 @@ def _gripper_closing(hand: HandModel, stated: Mapping[int, float]) -> Floats:
             f"no two surfaces of the hand come together when {', '.join(hand.dof_names[:4])} moves: its fingers are "
             "missing or have no collision shapes (add them), or do not move towards each other (correct axes or limits)"
         )
-    return _override(np.where((seen == 0) & ~prismatic_dofs(hand), hand.closing, seen), stated)
+    return _with_stated_closing(np.where((seen == 0) & ~prismatic_dofs(hand), hand.closing, seen), stated)
 
 
 def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int, ...]:
@@ -179,7 +179,7 @@ def _approach_between_fingers(hand: HandModel) -> tuple[Floats, bool]:
     if tied:
         # The plane's normal has no preferred sign: the sign is arbitrary and reported as a tie.
         normal = np.linalg.svd(np.vstack([bases, ends]) - bases.mean(axis=0))[2][-1]
-        along = normal * sign_of(normal)
+        along = normal * dominant_sign(normal)
     else:
         ways = _tip_motions(hand)
         _, strength, lines = np.linalg.svd(ways - ways.mean(axis=0))
@@ -305,7 +305,7 @@ def _planes(corners: Floats) -> list[Floats]:
 
 def _preshape(hand: HandModel, tree: Tree, options: HandOptions, share: float = PRESHAPE_SHARE) -> Floats:
     q = closing_posture(hand, share)
-    for dof, value in _by_dof(hand, tree, options.preshape):
+    for dof, value in _values_by_dof(hand, tree, options.preshape):
         if not hand.lower[dof] - 1e-6 <= value <= hand.upper[dof] + 1e-6:
             raise HandError(
                 f"preshape of {hand.dof_names[dof]!r} is {value:g}, outside its limits "
@@ -315,7 +315,7 @@ def _preshape(hand: HandModel, tree: Tree, options: HandOptions, share: float = 
     return np.clip(q, hand.lower, hand.upper)
 
 
-def _by_dof(hand: HandModel, tree: Tree, values: Mapping[str, float]) -> list[tuple[int, float]]:
+def _values_by_dof(hand: HandModel, tree: Tree, values: Mapping[str, float]) -> list[tuple[int, float]]:
     for name in values:
         if name not in tree.known:
             known = ", ".join(hand.dof_names[:8]) + (", ..." if hand.dofs > 8 else "")

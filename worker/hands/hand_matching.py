@@ -71,7 +71,9 @@ def match_hands(
     twins = dict(zip(ours.joint_body[joints].tolist(), theirs.joint_body.tolist(), strict=True))
     other = [twins[body] for body in tips]
     where = np.stack([apply(here[:, b], _body_centre(ours, b)) for b in tips], axis=1)
-    base, places = _fit(where[:_FITTED], there[:_FITTED, other], np.array([_body_centre(theirs, b) for b in other]))
+    base, places = _fit_base_pose(
+        where[:_FITTED], there[:_FITTED, other], np.array([_body_centre(theirs, b) for b in other])
+    )
     error = np.linalg.norm(apply(base, apply(there[:, other], places)) - where, axis=-1)
     if error.max() > tolerance_m:
         worst = tips[int(error.max(axis=0).argmax())]
@@ -124,7 +126,7 @@ def _body_centre(hand: HandModel, body: int) -> Floats:
     return np.concatenate(corners).mean(axis=0) if corners else np.zeros(3)
 
 
-def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
+def _fit_base_pose(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
     """Fit the other model's base pose (7,), and its fingertip positions (T, 3) in its body frames.
     `where` are fingertips (N, T, 3) in the base frame of `ours`. `poses` (N, T, 7) are bodies in the base frame of
     `theirs`. `guess` (T, 3) are approximate positions in these bodies."""

@@ -87,16 +87,16 @@ def closing_by_geometry(hand: HandModel) -> Floats:
     """Return each dof's direction (D,) that brings opposing surfaces together: +1, -1, or 0 for none.
     The sign is opposite to that of a sum over postures from the lower to the upper limits. Each summand is the area of
     facing surfaces times the speed at which they separate."""
-    points = _points(hand)
+    points = _visible_points(hand)
     balance, total = np.zeros(hand.dofs), np.zeros(hand.dofs)
     for share in np.linspace(0.05, 0.95, 5):
         q = hand.lower + share * hand.span
         place, normal = posed_points(hand, points, q)
-        motions = [_motion(hand, points, q, dof) for dof in range(hand.dofs)]
+        motions = [_point_velocities(hand, points, q, dof) for dof in range(hand.dofs)]
         # Absolute speed along the normal, relative to the fastest point's speed.
         speeds = [np.abs(np.einsum("ni,ni->n", m, normal)) / np.abs(m).max(initial=1e-12) for m in motions]
         moved = np.max(speeds, axis=0) > _LEADING
-        first, second, _ = _facing(place, normal, points, np.flatnonzero(moved))
+        first, second, _ = _facing_pairs(place, normal, points, np.flatnonzero(moved))
         for dof, motion in enumerate(motions):
             rate = np.einsum("ni,ni->n", motion[second] - motion[first], normal[first])
             # The rate of sliding surfaces is rounding noise.
@@ -118,7 +118,7 @@ def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
     closing = np.flatnonzero(hand.closing)
     if not 1 <= len(closing) <= MAX_DOFS or hand.dofs > MAX_DOFS:
         return None
-    points = _points(hand)
+    points = _visible_points(hand)
     path = closing_posture(hand, np.linspace(0.0, 1.0, _STEPS)[:, None])
     if _is_centric(hand, points, path):
         return None
@@ -132,7 +132,7 @@ def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
     return _measure_jaws(hand, points, sides, closing_posture(hand, np.linspace(0.0, share, _STEPS)[:, None]), approach)
 
 
-def _points(hand: HandModel) -> SurfacePoints:
+def _visible_points(hand: HandModel) -> SurfacePoints:
     """Sample the hand's surface in the posture that hides least of it: pads of closed jaws may overlap."""
     seen = [sample_surface(replace(hand, preshape=hand.lower + share * hand.span), _POINTS) for share in _LOOKS]
     return seen[int(np.argmax([points.area.sum() for points in seen]))]
@@ -144,13 +144,13 @@ def posed_points(hand: HandModel, points: SurfacePoints, q: Floats) -> tuple[Flo
     return apply(pose, points.position), quat_rotate(pose[:, 3:], points.normal)
 
 
-def _motion(hand: HandModel, points: SurfacePoints, q: Floats, dof: int) -> Floats:
+def _point_velocities(hand: HandModel, points: SurfacePoints, q: Floats, dof: int) -> Floats:
     """Return the derivative (N, 3) of the points by a dof [m/rad or 1]."""
     step = np.eye(hand.dofs)[dof] * (1e-4 * max(float(hand.span[dof]), 1e-3))
     return (posed_points(hand, points, q + step)[0] - posed_points(hand, points, q - step)[0]) / (2 * step[dof])
 
 
-def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -> tuple[Ints, Ints, Floats]:
+def _facing_pairs(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -> tuple[Ints, Ints, Floats]:
     """Return points of `among` that face another body, the nearest facing point of each, and gaps [m]."""
     aside = _ASIDE * np.sqrt(points.area.sum() / len(points))
     first, second, gaps = [], [], []
@@ -175,7 +175,9 @@ def _is_centric(hand: HandModel, points: SurfacePoints, path: Floats) -> bool:
     if len(ends) < 3:
         return False
     q, step = path[len(path) // 2], path[-1] - path[0]
-    motion = sum((_motion(hand, points, q, d) * step[d] for d in range(hand.dofs)), np.zeros((len(points), 3)))
+    motion = sum(
+        (_point_velocities(hand, points, q, d) * step[d] for d in range(hand.dofs)), np.zeros((len(points), 3))
+    )
     way = np.array([motion[points.body == body].mean(axis=0) for body in ends])
     strength = np.linalg.svd(way, compute_uv=False)
     return bool(strength[2] > _IN_SPACE * strength[0])
@@ -188,9 +190,11 @@ def _closed_posture(hand: HandModel, points: SurfacePoints, path: Floats) -> tup
     step, faced = path[-1] - path[0], np.zeros(hand.bodies)
     for k in range(len(path)):
         place, normal = posed_points(hand, points, path[k])
-        motion = sum((_motion(hand, points, path[k], d) * step[d] for d in range(hand.dofs)), np.zeros((1, 3)))
+        motion = sum(
+            (_point_velocities(hand, points, path[k], d) * step[d] for d in range(hand.dofs)), np.zeros((1, 3))
+        )
         leading = np.einsum("ni,ni->n", motion, normal) > _LEADING * np.abs(motion).max(initial=1e-12)
-        first, second, gap = _facing(place, normal, points, np.flatnonzero(leading))
+        first, second, gap = _facing_pairs(place, normal, points, np.flatnonzero(leading))
         rate = np.einsum("ni,ni->n", motion[first] - motion[second], normal[first])
         fast = rate > _FAST * rate.max(initial=1e-9)
         if not fast.any():
@@ -215,23 +219,23 @@ def _pad_points(
     # Dominant direction of the normals, weighted by area.
     values, vectors = np.linalg.eigh((points.area[every, None] * normal[every]).T @ normal[every])
     line = vectors[:, int(np.argmax(values))]
-    line = -sign_of(line) * line
+    line = -dominant_sign(line) * line
     along = normal[every] @ line
-    one, two = (_on_pads(every[side > _FACING_COS], points, faced) for side in (along, -along))
+    one, two = (_points_on_pads(every[side > _FACING_COS], points, faced) for side in (along, -along))
     if not len(one) or not len(two) or set(points.body[one]) & set(points.body[two]):
         return None
     # The first pad faces the second: it has the lower coordinate along the line.
     return (one, two) if (place[one].mean(axis=0) @ line) <= place[every].mean(axis=0) @ line else (two, one)
 
 
-def sign_of(line: Floats) -> float:
+def dominant_sign(line: Floats) -> float:
     """Return -1 if a line's largest component (the first of equal ones) is negative, else 1.
     The sign of a vector from a decomposition is rounding noise."""
     size = np.abs(line)
     return float(np.sign(line[int(np.argmax(size > (1 - 1e-6) * size.max()))]))
 
 
-def _on_pads(side: Ints, points: SurfacePoints, faced: Floats) -> Ints:
+def _points_on_pads(side: Ints, points: SurfacePoints, faced: Floats) -> Ints:
     most = float(faced[points.body[side]].max(initial=0.0))
     return side[faced[points.body[side]] >= _PAD_SHARE * most]
 
@@ -254,7 +258,7 @@ def _measure_jaws(
         middle[k] = (place[one].mean(axis=0) + place[two].mean(axis=0)) / 2
         axes[k] = axis
         for dof in range(hand.dofs):
-            motion = _motion(hand, points, q, dof)
+            motion = _point_velocities(hand, points, q, dof)
             speed[k, dof] = (motion[one] @ axis).mean(), -(motion[two] @ axis).mean()
     if not facing[-1]:
         return None
@@ -337,7 +341,7 @@ def fingertip_pad(hand: HandModel, tip: int) -> Pad:
     return Pad(tip, place[chosen].mean(axis=0), look / max(float(np.linalg.norm(look)), 1e-9), place[chosen])
 
 
-def thinnest_fingertip(hand: HandModel) -> float:
+def least_fingertip_width(hand: HandModel) -> float:
     """Return the least width of a fingertip in any direction [m]; 0 if one has no shape."""
     ways, tips = spread_directions(_DIRECTIONS), []
     for tip in hand.fingertips:

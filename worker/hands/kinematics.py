@@ -20,7 +20,7 @@ def body_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats) -> F
     poses[:, 0] = hand_pose
     joint_of_body = np.full(hand.bodies, -1)
     joint_of_body[hand.joint_body] = np.arange(len(hand.joint_body))
-    for level in _levels(hand.parent.tobytes()):
+    for level in _bodies_by_depth(hand.parent.tobytes()):
         value, axis = joints[:, joint_of_body[level]], hand.axis[level]
         turns = (hand.joint_type[level] == JointType.REVOLUTE)[:, None]
         rotation = np.where(turns, quat_from_axis_angle(axis, value), [1.0, 0, 0, 0])
@@ -30,7 +30,7 @@ def body_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats) -> F
 
 
 @lru_cache(maxsize=64)
-def _levels(parents: bytes) -> tuple[NDArray[np.intp], ...]:
+def _bodies_by_depth(parents: bytes) -> tuple[NDArray[np.intp], ...]:
     """Group bodies by their distance from the root, in ascending order and without the root."""
     parent = np.frombuffer(parents, np.int32)
     depth = np.zeros(len(parent), int)

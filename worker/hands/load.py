@@ -14,11 +14,11 @@ from graspd.service.model.digests import digest_files, digest_variant
 from graspd.service.model.errors import HandError, InputError, NotFoundError, did_you_mean
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats, compose
-from graspd.service.store.assets import builtin_files, builtin_names, unpack_file, without_common_folder
-from graspd.service.store.hand_files import files_of_hand, hand_name, main_of
+from graspd.service.store.assets import builtin_files, builtin_names, strip_common_folder, unpack_file
+from graspd.service.store.hand_files import find_hand_files, find_main_file, hand_name
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands import collisions, guess, primitives, shapes
-from graspd.worker.hands.collisions import resting_neighbours
+from graspd.worker.hands.collisions import collision_exempt_pairs
 from graspd.worker.hands.guess import complete_hand
 from graspd.worker.hands.jaws import jaws_of, prismatic_dofs
 from graspd.worker.hands.model import ConvexPiece, Drag, HandModel, JointType, PalmFrame
@@ -32,7 +32,7 @@ from graspd.worker.hands.options import (
     parse_options,
 )
 from graspd.worker.hands.primitives import volume
-from graspd.worker.hands.robot import Joint, Mimic, Robot, chain_to
+from graspd.worker.hands.robot import Joint, Mimic, Robot, joint_chain
 from graspd.worker.hands.shapes import Hulls, make_pieces
 from graspd.worker.hands.tendons import tendons_of
 from graspd.worker.hands.tree import Tree, build_tree
@@ -54,7 +54,7 @@ def load_hand(
     and dry friction. Raises HandError: the files describe no usable hand; the message names the fault and the fix."""
     source = HandSource.read(files, options, name=name, digest=digest)
     with caching_steps("hand_shapes", (digest_files(AssetKind.HAND, files),), (collisions, guess, primitives, shapes)):
-        hand = assemble(source)
+        hand = build_hand(source)
     return replace(hand, drag=_drag(source.robot, hand)) if drag else hand
 
 
@@ -85,18 +85,18 @@ class HandSource:
         return cls(read_robot(files, main, settings.xacro), settings, files, main, name, digest, run)
 
 
-def assemble(source: HandSource) -> HandModel:
+def build_hand(source: HandSource) -> HandModel:
     """Build the model of a hand. Raises TaskCancelled if its run is cancelled."""
     tree = build_tree(source.robot, source.options)
     hand = complete_hand(body_model(source, tree), tree, source.options)
-    hand = with_default_drives(hand, stated_gains(source, tree.dof_names), assumed_efforts(source, tree.dof_names))
-    mounting, fault = mounting_of(source, hand)
+    hand = with_default_drives(hand, stated_gains(source, tree.dof_names), dofs_without_effort(source, tree.dof_names))
+    mounting, fault = build_mounting(source, hand)
     if fault:
         log.warning("%s: %s", source.name, fault)
-    return replace(hand, neighbours=resting_neighbours(hand), mounting=mounting)
+    return replace(hand, neighbours=collision_exempt_pairs(hand), mounting=mounting)
 
 
-def mounting_of(source: HandSource, hand: HandModel) -> tuple[HandModel | None, str]:
+def build_mounting(source: HandSource, hand: HandModel) -> tuple[HandModel | None, str]:
     """Return the model of the links above the hand's root, or None, and the reason if it cannot be built.
     A fault above a hand does not make the hand unusable."""
     tree = mounting_tree(source.robot, hand.root_link, source.options)
@@ -162,7 +162,7 @@ def body_model(source: HandSource, tree: Tree) -> HandModel:
         neighbours=frozenset(),
         masses=_masses(robot, tree, pieces),
         velocity=tree.velocity,
-        arm=chain_to(robot, root),
+        arm=joint_chain(robot, root),
         visuals=Visuals(visuals, source.files, base),
         frames=dict(tree.links),
         tendons=tendons_of(robot, source.options.tendons, tree.dof_names),
@@ -172,7 +172,7 @@ def body_model(source: HandSource, tree: Tree) -> HandModel:
 def main_file(files: Mapping[str, bytes], options: HandOptions) -> str:
     """Return the name of the file that describes the hand: from the options, else the only one."""
     try:
-        return main_of(files, options.file)
+        return find_main_file(files, options.file)
     except InputError as error:
         raise HandError(str(error)) from None
 
@@ -196,7 +196,7 @@ def _joint_type(joint: Joint | None) -> JointType:
     return JointType.PRISMATIC if joint.type == "prismatic" else JointType.REVOLUTE
 
 
-def assumed_efforts(source: HandSource, dofs: Sequence[str]) -> list[str]:
+def dofs_without_effort(source: HandSource, dofs: Sequence[str]) -> list[str]:
     """Return the dofs whose torque or force limit neither the robot nor the options state."""
     stated = source.options.effort
     known = dofs if isinstance(stated, float) else stated or {}
@@ -206,7 +206,7 @@ def assumed_efforts(source: HandSource, dofs: Sequence[str]) -> list[str]:
 def _effort(source: HandSource, tree: Tree) -> Floats:
     said = source.options.effort
     efforts = dict.fromkeys(tree.dof_names, said) if isinstance(said, float) else said or {}
-    assumed = dict.fromkeys(assumed_efforts(source, tree.dof_names), DEFAULT_EFFORT)
+    assumed = dict.fromkeys(dofs_without_effort(source, tree.dof_names), DEFAULT_EFFORT)
     values = [efforts.get(dof, assumed.get(dof, source.robot.joints[dof].effort)) for dof in tree.dof_names]
     for dof, effort in zip(tree.dof_names, values, strict=True):
         if effort <= 0:
@@ -261,8 +261,8 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
         meant = did_you_mean(str(path), known)
         raise NotFoundError(f"{path} is neither a file nor a built-in hand ({', '.join(known)}){meant}")
     if path.suffix.lower() == ".zip":
-        return path.stem, without_common_folder(unpack_file(path)), {}
-    found, main = files_of_hand(path)
+        return path.stem, strip_common_folder(unpack_file(path)), {}
+    found, main = find_hand_files(path)
     files = {name: file.read_bytes() for name, file in found.items()}
     return hand_name(path.resolve().name), files, {"file": main} if main else {}
 

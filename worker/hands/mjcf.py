@@ -15,7 +15,7 @@ import numpy as np
 
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
-from graspd.worker.hands.mjcf_drives import Couplings, chain_up, commanded_ranges, servo_parameters
+from graspd.worker.hands.mjcf_drives import Couplings, bodies_to_root, commanded_ranges, servo_parameters
 from graspd.worker.hands.mjcf_source import inline_model
 from graspd.worker.hands.primitives import hull
 from graspd.worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, build_robot
@@ -42,11 +42,11 @@ def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
     reader = _Reader(model, main, notes)
     roots = reader.roots()
     if len(roots) == 1 and not reader.joints_of(roots[0]):
-        reader.body(roots[0], "", IDENTITY_POSE)
+        reader.add_body(roots[0], "", IDENTITY_POSE)
     else:
         reader.links.append(Link("world", (), None))
         for body in roots:
-            reader.body(body, "world", _pose(model.body_pos[body], model.body_quat[body]))
+            reader.add_body(body, "world", _pose(model.body_pos[body], model.body_quat[body]))
     return build_robot("", reader.links, reader.joints, reader.notes, main, "MJCF", reader.tendons)
 
 
@@ -72,7 +72,7 @@ class _Reader:
         """Return the world's children with moving joints; its other children belong to the environment."""
         model = self.model
         joints = [(int(model.jnt_type[j]), int(model.jnt_bodyid[j])) for j in range(model.njnt)]
-        moving = {chain_up(model, body)[-1] for kind, body in joints if kind in (_HINGE, _SLIDE)}
+        moving = {bodies_to_root(model, body)[-1] for kind, body in joints if kind in (_HINGE, _SLIDE)}
         if not moving:
             raise HandError(f"{self.main}: no moving joint; a hand needs at least one hinge or slide joint")
         free = [self.body_name(body) for kind, body in joints if kind == _FREE and body in moving]
@@ -89,7 +89,7 @@ class _Reader:
     def joint_name(self, joint: int) -> str:
         return str(self.model.joint(joint).name) or f"{self.body_name(int(self.model.jnt_bodyid[joint]))}_joint_{joint}"
 
-    def body(self, body: int, parent: str, pose: Floats) -> None:
+    def add_body(self, body: int, parent: str, pose: Floats) -> None:
         """Add a body at a (7,) pose on link `parent`, and all bodies below it.
         MuJoCo moves a body by its joints one after another, each about its own anchor in the body's frame."""
         stack = [(body, parent, pose)]

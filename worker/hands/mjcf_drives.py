@@ -46,13 +46,13 @@ class Couplings:
             self._add_equality(equality)
         self._add_tendons()
         self._add_loops([e for e in active if model.eq_type[e] == int(mujoco.mjtEq.mjEQ_CONNECT)])
-        self._hold_followers()
+        self._fix_followers()
 
     def _add_equality(self, equality: int) -> None:
         first, second = int(self.model.eq_obj1id[equality]), int(self.model.eq_obj2id[equality])
         polynomial, kind = np.asarray(self.model.eq_data[equality, :5]), int(self.model.eq_type[equality])
         if kind == int(mujoco.mjtEq.mjEQ_JOINT):
-            self._couple(first, second, polynomial)
+            self._couple_joints(first, second, polynomial)
         if kind != int(mujoco.mjtEq.mjEQ_TENDON):
             return
         ends = [joints_on_tendon(self.model, tendon) if tendon >= 0 else [] for tendon in (first, second)]
@@ -61,36 +61,36 @@ class Couplings:
         elif len(ends[0]) == len(ends[1]) == 1:
             # c1 (q1 - q1_0) = p(c2 (q2 - q2_0))
             ((one, own),), ((other, pull),) = ends
-            self._couple(one, other, polynomial * pull ** np.arange(5) / own)
+            self._couple_joints(one, other, polynomial * pull ** np.arange(5) / own)
         else:
             self.notes.append("an equality of tendons with several joints was left out")
 
-    def _hold_followers(self) -> None:
+    def _fix_followers(self) -> None:
         """Fix the joints that follow a fixed joint."""
         held = {self.name(joint): value for joint, value in self.follows.items() if isinstance(value, float)}
         while moved := [(j, f) for j, f in self.follows.items() if isinstance(f, Mimic) and f.joint in held]:
             for joint, follows in moved:
                 value = follows.multiplier * held[follows.joint] + follows.offset
-                self.follows[joint] = held[self.name(joint)] = float(np.clip(value, *self._range(joint)))
+                self.follows[joint] = held[self.name(joint)] = float(np.clip(value, *self._joint_range(joint)))
 
-    def _couple(self, first: int, second: int, polynomial: Floats) -> None:
+    def _couple_joints(self, first: int, second: int, polynomial: Floats) -> None:
         """Couple by first - first0 = p(second - second0); a nonlinear p is replaced by its best line."""
         if second < 0:
-            self.follows[first] = self._rest(first) + float(polynomial[0])
+            self.follows[first] = self._rest_position(first) + float(polynomial[0])
             return
-        if first in self.follows or first == second or self._follows(second, first):
+        if first in self.follows or first == second or self._is_driven_by(second, first):
             self.notes.append(f"a second equality of {self.name(first)!r} was left out")
             return
         constant, slope = float(polynomial[0]), float(polynomial[1])
         if np.abs(polynomial[2:]).max() > 1e-9:
-            at = np.linspace(*self._range(second), _RANGE_POINTS) - self._rest(second)
+            at = np.linspace(*self._joint_range(second), _RANGE_POINTS) - self._rest_position(second)
             values = np.asarray(np.polynomial.polynomial.polyval(at, polynomial), float)
             slope, constant, error = _fit_line(at, values)
             self.notes.append(f"{self.name(first)!r} follows {self.name(second)!r} by a line within {error:.2g}")
-        offset = self._rest(first) + constant - slope * self._rest(second)
+        offset = self._rest_position(first) + constant - slope * self._rest_position(second)
         self.follows[first] = Mimic(self.name(second), slope, offset)
 
-    def _follows(self, joint: int, first: int) -> bool:
+    def _is_driven_by(self, joint: int, first: int) -> bool:
         """Check whether a joint follows another one through any chain."""
         number = {self.name(j): j for j in self.follows}
         while isinstance(follows := self.follows.get(joint), Mimic):
@@ -108,9 +108,9 @@ class Couplings:
             return
         joint, coefficient = free[-1]
         ((driver, pull),) = [pair for pair in pulled if pair[0] != joint]
-        at = np.linspace(*self._range(driver), _RANGE_POINTS)
-        line = self._rest(joint) + (length - pull * (at - self._rest(driver))) / coefficient
-        values = np.clip(line, *self._range(joint))
+        at = np.linspace(*self._joint_range(driver), _RANGE_POINTS)
+        line = self._rest_position(joint) + (length - pull * (at - self._rest_position(driver))) / coefficient
+        values = np.clip(line, *self._joint_range(joint))
         if np.ptp(values) < 1e-6:
             self.follows[joint] = float(values[0])
             reason = "its limits prevent the motion that its tendon requires"
@@ -130,7 +130,7 @@ class Couplings:
             free = [(j, c) for j, c in pulled if j not in self.follows and j not in alone and abs(c) > 1e-9]
             if len(free) < 2:
                 continue
-            if self._form_chain([joint for joint, _ in free]):
+            if self._is_chain([joint for joint, _ in free]):
                 self.tendons[str(self.model.actuator(actuator).name) or f"tendon_{actuator}"] = dict(free)
                 continue
             (driver, pull), *others = free
@@ -139,32 +139,34 @@ class Couplings:
             followers = ", ".join(self.name(joint) for joint, _ in others)
             self.notes.append(f"{followers} assumed to follow {self.name(driver)} on their tendon")
 
-    def _form_chain(self, joints: list[int]) -> bool:
+    def _is_chain(self, joints: list[int]) -> bool:
         """Check whether the joints form one chain."""
-        chains = sorted((set(chain_up(self.model, int(self.model.jnt_bodyid[joint]))) for joint in joints), key=len)
+        chains = sorted(
+            (set(bodies_to_root(self.model, int(self.model.jnt_bodyid[joint]))) for joint in joints), key=len
+        )
         return all(a <= b for a, b in itertools.pairwise(chains))
 
-    def _range(self, joint: int) -> tuple[float, float]:
+    def _joint_range(self, joint: int) -> tuple[float, float]:
         lower, upper = self.model.jnt_range[joint] if self.model.jnt_limited[joint] else (-np.pi, np.pi)
         return float(lower), float(upper)
 
-    def _rest(self, joint: int) -> float:
+    def _rest_position(self, joint: int) -> float:
         return float(self.model.qpos0[self.model.jnt_qposadr[joint]])
 
     def _add_loops(self, loops: list[int]) -> None:
         """Solve the loops of the model; record a fault for joints of a loop that cannot be solved."""
-        for group in _groups(self.model, loops):
+        for group in _connected_loops(self.model, loops):
             joints = sorted({j for e in group for j in _loop_joints(self.model, e)})
             passive = [j for j in joints if j not in self._actuated and j not in self.follows]
             if not passive:
                 continue
             try:
-                self._follow(group, joints, passive)
+                self._add_loop_mimics(group, joints, passive)
             except HandError as error:
                 # The fault only matters if the hand moves by this joint.
                 self.faults |= dict.fromkeys(passive, str(error))
 
-    def _follow(self, group: list[int], joints: list[int], passive: list[int]) -> None:
+    def _add_loop_mimics(self, group: list[int], joints: list[int], passive: list[int]) -> None:
         """Add the mimics of the passive joints in a group of loops.
         Raises HandError: a joint is no hinge or slide, the group has no single driver, it does not close over the
         driver's range, or a joint depends on the driver nonlinearly."""
@@ -186,7 +188,7 @@ class Couplings:
                 "leave one actuator in it, or write equalities of joints instead of the loop"
             )
         driver = self.name(drivers[0])
-        values, followers = self._solve(group, drivers[0], passive)
+        values, followers = self._solve_loops(group, drivers[0], passive)
         lines = [_fit_line(values, follower) for follower in followers.T]
         for joint, (_, _, error) in zip(passive, lines, strict=True):
             if error > MAX_ERROR_RAD:
@@ -199,16 +201,16 @@ class Couplings:
         worst = max(error for _, _, error in lines)
         self.notes.append(f"{', '.join(map(self.name, passive))} follow {driver} within {worst:.2g} rad")
 
-    def _solve(self, loops: list[int], driver: int, passive: list[int]) -> tuple[Floats, Floats]:
+    def _solve_loops(self, loops: list[int], driver: int, passive: list[int]) -> tuple[Floats, Floats]:
         """Return the values of the driver (S,) and of the passive joints (S, P) at which the loops are closed."""
         data = mujoco.MjData(self.model)
-        lower, upper = self._range(driver)
-        start = float(np.clip(self._rest(driver), lower, upper))
+        lower, upper = self._joint_range(driver)
+        start = float(np.clip(self._rest_position(driver), lower, upper))
         values = np.linspace(lower, upper, _STEPS)
         # From the model's initial value to both ends; each step starts from the last solution.
         order = np.concatenate([np.flatnonzero(values >= start), np.flatnonzero(values < start)[::-1]])
         solved = np.full((_STEPS, len(passive)), np.nan)
-        rest = np.array([self._rest(joint) for joint in passive])
+        rest = np.array([self._rest_position(joint) for joint in passive])
         for step in order:
             behind = step - 1 if values[step] >= start else step + 1
             known = 0 <= behind < _STEPS and not np.isnan(solved[behind]).any()
@@ -226,7 +228,7 @@ def _fit_line(at: Floats, values: Floats) -> tuple[float, float, float]:
     return slope, constant, float(np.abs(values - constant - slope * at).max())
 
 
-def _groups(model: Any, loops: list[int]) -> list[list[int]]:
+def _connected_loops(model: Any, loops: list[int]) -> list[list[int]]:
     groups: list[tuple[set[int], list[int]]] = []
     for loop in loops:
         joints = set(_loop_joints(model, loop))
@@ -236,7 +238,7 @@ def _groups(model: Any, loops: list[int]) -> list[list[int]]:
     return [members for _, members in groups]
 
 
-def _ends(model: Any, loop: int) -> tuple[int, int]:
+def _loop_bodies(model: Any, loop: int) -> tuple[int, int]:
     first, second = int(model.eq_obj1id[loop]), int(model.eq_obj2id[loop])
     if model.eq_objtype[loop] == int(mujoco.mjtObj.mjOBJ_SITE):
         return int(model.site_bodyid[first]), int(model.site_bodyid[second])
@@ -245,7 +247,7 @@ def _ends(model: Any, loop: int) -> tuple[int, int]:
 
 def _loop_joints(model: Any, loop: int) -> list[int]:
     """Return the joints between a loop's ends and the body at which their chains branch."""
-    chains = [chain_up(model, body) for body in _ends(model, loop)]
+    chains = [bodies_to_root(model, body) for body in _loop_bodies(model, loop)]
     common = set(chains[0]) & set(chains[1])
     return [
         joint
@@ -256,7 +258,7 @@ def _loop_joints(model: Any, loop: int) -> list[int]:
     ]
 
 
-def chain_up(model: Any, body: int) -> list[int]:
+def bodies_to_root(model: Any, body: int) -> list[int]:
     """Return the bodies from this one up to a child of the world."""
     found = []
     while body:
@@ -281,7 +283,7 @@ def _close_loops(
         rows, residuals = [], []
         for loop in loops:
             points = _anchors(model, data, loop)
-            for k, (point, body) in enumerate(zip(points, _ends(model, loop), strict=True)):
+            for k, (point, body) in enumerate(zip(points, _loop_bodies(model, loop), strict=True)):
                 mujoco.mj_jac(model, data, jacobians[k], None, point, body)
             rows.append((jacobians[0] - jacobians[1])[:, dofs])
             residuals.append(points[0] - points[1])
@@ -299,7 +301,7 @@ def _anchors(model: Any, data: Any, loop: int) -> tuple[Floats, Floats]:
     if model.eq_objtype[loop] == int(mujoco.mjtObj.mjOBJ_SITE):
         return data.site_xpos[int(model.eq_obj1id[loop])], data.site_xpos[int(model.eq_obj2id[loop])]
     points = []
-    for body, local in zip(_ends(model, loop), (model.eq_data[loop, :3], model.eq_data[loop, 3:6]), strict=True):
+    for body, local in zip(_loop_bodies(model, loop), (model.eq_data[loop, :3], model.eq_data[loop, 3:6]), strict=True):
         points.append(data.xpos[body] + data.xmat[body].reshape(3, 3) @ local)
     return points[0], points[1]
 
@@ -318,14 +320,14 @@ def servo_parameters(
         gear = float(model.actuator_gear[actuator, 0])
         rates: dict[int, float] = {}
         for joint, coefficient in driven_joints(model, actuator):
-            driver, rate = _driver(joint, mimics, joint_of)
+            driver, rate = _driving_joint(joint, mimics, joint_of)
             if driver is not None:
                 rates[driver] = rates.get(driver, 0.0) + coefficient * rate
         for joint, rate in rates.items():
             arm = abs(gear * rate)
-            gain = _gain(model, actuator) * (len(rates) if joint in shared else 1)
+            gain = _servo_gain(model, actuator) * (len(rates) if joint in shared else 1)
             effort, stiffness = found.get(joint, (0.0, 0.0))
-            found[joint] = effort + arm * _force(model, actuator), stiffness + arm**2 * gain
+            found[joint] = effort + arm * _force_limit(model, actuator), stiffness + arm**2 * gain
     for joint, (effort, stiffness) in found.items():
         if model.jnt_actfrclimited[joint]:
             most = float(np.abs(model.jnt_actfrcrange[joint]).max())
@@ -337,7 +339,7 @@ def commanded_ranges(model: Any) -> dict[int, tuple[float, float]]:
     """Return the range of equilibrium positions that each joint's position servo can command."""
     found = {}
     for actuator in range(model.nu):
-        kind, gain = int(model.actuator_trntype[actuator]), _gain(model, actuator)
+        kind, gain = int(model.actuator_trntype[actuator]), _servo_gain(model, actuator)
         gear = float(model.actuator_gear[actuator, 0])
         if kind != int(mujoco.mjtTrn.mjTRN_JOINT) or gain <= 0 or not gear or not model.actuator_ctrllimited[actuator]:
             continue
@@ -363,7 +365,9 @@ def joints_on_tendon(model: Any, tendon: int) -> list[tuple[int, float]]:
     return [(int(model.wrap_objid[w]), float(model.wrap_prm[w])) for w in wraps]
 
 
-def _driver(joint: int, mimics: Mapping[int, Mimic | float], joint_of: Mapping[str, int]) -> tuple[int | None, float]:
+def _driving_joint(
+    joint: int, mimics: Mapping[int, Mimic | float], joint_of: Mapping[str, int]
+) -> tuple[int | None, float]:
     """Return the joint that drives `joint` through mimics, and the total rate; None and 0 if it is fixed."""
     rate = 1.0
     for _ in range(len(mimics) + 1):
@@ -377,7 +381,7 @@ def _driver(joint: int, mimics: Mapping[int, Mimic | float], joint_of: Mapping[s
     return None, 0.0
 
 
-def _force(model: Any, actuator: int) -> float:
+def _force_limit(model: Any, actuator: int) -> float:
     """Return the largest force; 0 if the model states none."""
     if model.actuator_forcelimited[actuator]:
         return float(np.abs(model.actuator_forcerange[actuator]).max())
@@ -386,7 +390,7 @@ def _force(model: Any, actuator: int) -> float:
     return 0.0
 
 
-def _gain(model: Any, actuator: int) -> float:
+def _servo_gain(model: Any, actuator: int) -> float:
     """Return the gain of a position servo; 0 for other actuators."""
     if model.actuator_biastype[actuator] != int(mujoco.mjtBias.mjBIAS_AFFINE):
         return 0.0

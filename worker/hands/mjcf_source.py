@@ -59,7 +59,7 @@ def inline_model(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, 
             # MuJoCo refuses other attributes here, which other readers ignore.
             element.attrib = {name: value for name, value in element.attrib.items() if name == "class"}
     notes = _ignored_elements(root)
-    _prune(root)
+    _remove_unread_elements(root)
     _prune_actuators(root)
     compiler = root.find("compiler")
     if compiler is None:
@@ -134,14 +134,14 @@ def _expand_includes(root: Element, files: Mapping[str, bytes], main: str, here:
             if counts[0] > _MAX_INCLUDES:
                 raise HandError(f"{main}: more than {_MAX_INCLUDES} includes, or a file that includes itself")
             wanted = child.get("file", "")
-            name = _find(wanted, files, [posixpath.dirname(main), posixpath.dirname(here)], main, "includes")
+            name = _find_file(wanted, files, [posixpath.dirname(main), posixpath.dirname(here)], main, "includes")
             check_format(name, files[name], HandError)
             part = parse_xml(files[name], name, limit_bytes=MAX_BYTES)
             _expand_includes(part, files, main, name, counts)
             parent[at : at + 1] = list(part)
 
 
-def _find(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str, does: str) -> str:
+def _find_file(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str, does: str) -> str:
     """Return the name in `files` of a file that a model names; search relative to each folder."""
     path = wanted.replace("\\", "/")
     inside, like = False, []
@@ -178,7 +178,7 @@ def _add_mesh(
     """Rename a mesh's file to a number, and add the file to `assets`; `where`: see `_mesh_folder`."""
     (folder, strip), file = where, PurePosixPath(element.attrib["file"].replace("\\", "/"))
     wanted = file.name if strip else element.attrib["file"]
-    name = _find(posixpath.join(folder, wanted), files, [posixpath.dirname(main), ""], main, "names the mesh")
+    name = _find_file(posixpath.join(folder, wanted), files, [posixpath.dirname(main), ""], main, "names the mesh")
     suffix = PurePosixPath(name).suffix.lower()
     if suffix not in _MESHES:
         raise HandError(f"{main}: the mesh {name!r} is no file of type {', '.join(_MESHES)}; convert it")
@@ -191,12 +191,12 @@ def _add_mesh(
     element.attrib.pop("content_type", None)
 
 
-def _prune(element: Element) -> None:
+def _remove_unread_elements(element: Element) -> None:
     for child in list(element):
         if child.tag in _LEFT_OUT or (child.tag == "geom" and child.get("type") in ("hfield", "sdf")):
             element.remove(child)
         else:
-            _prune(child)
+            _remove_unread_elements(child)
 
 
 def _prune_actuators(root: Element) -> None:

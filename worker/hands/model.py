@@ -18,7 +18,7 @@ from graspd.worker.hands.primitives import HandFeatures
 from graspd.worker.hands.robot import Ints, Joint
 from graspd.worker.hands.tendons import Tendon
 from graspd.worker.hands.visuals import NO_VISUALS, Visuals
-from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_of
+from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_digest
 
 
 class JointType(IntEnum):
@@ -119,12 +119,12 @@ class HandModel:
 
     @cached_property
     def content(self) -> str:
-        """Digest of all fields that `content_of` includes; `digest` is the digest of the source files."""
-        return content_of(self)
+        """Digest of all fields that `content_digest` includes; `digest` is the digest of the source files."""
+        return content_digest(self)
 
     @cached_property
     def features(self) -> HandFeatures:
-        return HandFeatures.of(self.pieces)
+        return HandFeatures.from_pieces(self.pieces)
 
     @property
     def bodies(self) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.options import HandOptions
-from graspd.worker.hands.robot import Joint, Mimic, Robot, chain_to
+from graspd.worker.hands.robot import Joint, Mimic, Robot, joint_chain
 from graspd.worker.hands.tree import LEAST_RANGE, Body, Tree, joint_motion
 
 #: Limits of a wrist: number of joints, range of each [rad], and distance from the root along the joints [m]. The last
@@ -33,10 +33,10 @@ def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
     bodies = [Body(root)]
     links: dict[str, tuple[int, Floats]] = {}
     pose, way = IDENTITY_POSE.copy(), 0.0
-    for joint in reversed(chain_to(robot, root)):
+    for joint in reversed(joint_chain(robot, root)):
         if joint.parent in options.drop:
             break
-        value = _value(joint, options)
+        value = _fixed_value(joint, options)
         if value is None:
             if len(bodies) > MAX_WRIST_JOINTS or way > MAX_WRIST_M or not _is_wrist_joint(joint):
                 break
@@ -56,7 +56,7 @@ def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
     return Tree(tuple(bodies), links, drives, moving, moving, lower, upper, velocity, (), frozenset())
 
 
-def _value(joint: Joint, options: HandOptions) -> float | None:
+def _fixed_value(joint: Joint, options: HandOptions) -> float | None:
     """Return the value [rad or m] of a joint that does not move; None if it moves."""
     if joint.type == "fixed":
         return 0.0

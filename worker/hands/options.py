@@ -92,7 +92,7 @@ def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
     try:
         notes = json.loads(files["hand.json"])
         noted = notes.get("urdf", urdf)
-        if noted is not None and not _is_among(noted, files, urdf):
+        if noted is not None and not _is_same_urdf(noted, files, urdf):
             return {}
         if "palm_link" in notes:
             options["palm"] = {"link": notes["palm_link"], "approach": notes.get("palm_normal_in_palm_link")}
@@ -108,7 +108,7 @@ def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
     return options
 
 
-def _is_among(noted: str, files: Mapping[str, bytes], urdf: object) -> bool:
+def _is_same_urdf(noted: str, files: Mapping[str, bytes], urdf: object) -> bool:
     """Check whether `hand.json` names this URDF; only the file names are compared."""
     named = [name for name in files if PurePosixPath(name).name == PurePosixPath(noted).name]
     return bool(named) and PurePosixPath(str(urdf or noted)).name == PurePosixPath(noted).name

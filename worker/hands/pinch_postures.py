@@ -54,7 +54,7 @@ _CLOSING_M: Final = 0.003
 
 
 @dataclass(frozen=True)
-class Oppositions:
+class PinchPostures:
     """K postures in which pads of a hand face one another, sorted by width; root frame."""
 
     q: Floats  # (K, D)
@@ -71,54 +71,56 @@ class Oppositions:
         return float(self.width[-1]) if len(self) else 0.0
 
     @classmethod
-    def empty(cls, hand: HandModel) -> Oppositions:
+    def empty(cls, hand: HandModel) -> PinchPostures:
         return cls(np.zeros((0, hand.dofs)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
     @classmethod
-    def of(cls, q: Floats, seen: Any, good: NDArray[np.intp]) -> Oppositions:
+    def select(cls, q: Floats, seen: Any, good: NDArray[np.intp]) -> PinchPostures:
         """Select the rows `good` of postures and of their evaluation `seen`, sorted by width."""
         good = good[np.argsort(seen.width[good], kind="stable")]
         return cls(q[good], seen.axis[good], seen.middle[good], seen.width[good])
 
     @classmethod
-    def cached(cls, kind: str, key: tuple[str, ...], make: Callable[[], Oppositions], *more: ModuleType) -> Oppositions:
+    def load_or_search(
+        cls, kind: str, key: tuple[str, ...], make: Callable[[], PinchPostures], *more: ModuleType
+    ) -> PinchPostures:
         """Load postures from the disk cache, or make and cache them; modules `more` are part of the key."""
         return cls(**cached_arrays(kind, key, (*_code(), *more), lambda: vars(make())))
 
 
 @cached_by_content(32)
-def oppositions_of(hand: HandModel) -> Oppositions:
+def pinch_postures_of(hand: HandModel) -> PinchPostures:
     """Return the opposed postures of a hand, cached in memory and on disk; none for hands with one finger."""
-    return Oppositions.cached("oppositions", (hand.content,), lambda: _oppositions(hand))
+    return PinchPostures.load_or_search("oppositions", (hand.content,), lambda: _search_postures(hand))
 
 
 def _code() -> tuple[ModuleType, ...]:
     return (sys.modules[__name__], closing, guess, jaws, kinematics, primitives, surface, transforms)
 
 
-def _oppositions(hand: HandModel) -> Oppositions:
+def _search_postures(hand: HandModel) -> PinchPostures:
     if len(hand.fingertips) < 2:
-        return Oppositions.empty(hand)
-    one = opposed_finger(hand)
+        return PinchPostures.empty(hand)
+    one = opposing_finger(hand)
     pads = [fingertip_pad(hand, body) for body in hand.fingertips]
     q = random_postures(hand, one, CROWD * POSTURES)
-    seen = _PadGaps.of(hand, pads, one, q)
+    seen = _PadGaps.measure(hand, pads, one, q)
     # Select the best of postures with similar widths, then improve it.
     order = np.argsort(seen.width, kind="stable").reshape(POSTURES, CROWD)
     q = q[order[np.arange(POSTURES), seen.cost(seen.width)[order].argmin(axis=1)]]
     wanted = np.linspace(THINNEST_M, np.quantile(seen.width, 0.98), POSTURES)
-    q = improve_postures(hand, one, q, lambda tried: _PadGaps.of(hand, pads, one, tried).cost(wanted))
-    seen = _PadGaps.of(hand, pads, one, q)
+    q = improve_postures(hand, one, q, lambda tried: _PadGaps.measure(hand, pads, one, tried).cost(wanted))
+    seen = _PadGaps.measure(hand, pads, one, q)
     faces = (seen.facing > FACING) & (seen.square < SQUARE)
-    return Oppositions.of(q, seen, np.flatnonzero(faces & (seen.width > THINNEST_M) & (seen.ahead > AHEAD_M)))
+    return PinchPostures.select(q, seen, np.flatnonzero(faces & (seen.width > THINNEST_M) & (seen.ahead > AHEAD_M)))
 
 
-def opposed_finger(hand: HandModel) -> int:
+def opposing_finger(hand: HandModel) -> int:
     """Return the fingertip that opposes the others best, usually the thumb's."""
     pads = [fingertip_pad(hand, body) for body in hand.fingertips]
     costs = []
     for one in range(len(pads)):
-        seen = _PadGaps.of(hand, pads, one, random_postures(hand, one, POSTURES))
+        seen = _PadGaps.measure(hand, pads, one, random_postures(hand, one, POSTURES))
         costs.append(float(np.sort(seen.cost(seen.width))[: POSTURES // 4].mean()))
     return costs.index(min(costs))
 
@@ -135,7 +137,7 @@ class _PadGaps:
     ahead: Floats  # (N,) distance of the line's middle in front of the palm [m]
 
     @classmethod
-    def of(cls, hand: HandModel, pads: list[Pad], one: int, q: Floats) -> _PadGaps:
+    def measure(cls, hand: HandModel, pads: list[Pad], one: int, q: Floats) -> _PadGaps:
         tips = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))[:, list(hand.fingertips)]
         place = apply(tips, np.array([p.centre for p in pads]))
         looks = quat_rotate(tips[..., 3:], np.array([p.normal for p in pads]))
@@ -159,7 +161,7 @@ class _PadGaps:
 def improve_postures(hand: HandModel, one: int, q: Floats, cost: Callable[[Floats], Floats]) -> Floats:
     """Decrease the `cost` (N,) of postures (N, D) by random steps of decreasing size."""
     rng = np.random.default_rng(one)
-    finger, rank = _ranks(hand)
+    finger, rank = _finger_ranks(hand)
     best = cost(q)
     for step in np.geomspace(0.3, 0.03, CLIMBS):
         together = np.where(hand.closing != 0, rng.standard_normal((len(q), rank.max() + 1))[:, rank], 0.0)
@@ -175,7 +177,7 @@ def improve_postures(hand: HandModel, one: int, q: Floats, cost: Callable[[Float
 def random_postures(hand: HandModel, one: int, count: int) -> Floats:
     """Return postures (count, D): finger `one` is random; dofs of equal rank in others close alike."""
     rng = np.random.default_rng(one)
-    finger, rank = _ranks(hand)
+    finger, rank = _finger_ranks(hand)
     opened = np.where(hand.closing >= 0, hand.lower, hand.upper)
     closed = np.where(hand.closing >= 0, hand.upper, hand.lower)
     by_rank = rng.random((count, rank.max() + 1))[:, rank] + UNEVEN * rng.standard_normal((count, hand.dofs))
@@ -186,7 +188,7 @@ def random_postures(hand: HandModel, one: int, count: int) -> Floats:
     return np.asarray(np.where(still, np.clip(aside, hand.lower, hand.upper), q), float)
 
 
-def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _finger_ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the finger (D,) of each dof: -1 if several fingers share the dof, -2 if it drives none.
     Also return the number of joints of that finger between the dof and the tip."""
     finger, rank = np.full(hand.dofs, -2, np.intp), np.zeros(hand.dofs, np.intp)
@@ -235,7 +237,7 @@ def can_oppose(hand: HandModel) -> bool:
     least, most = gaps.copy(), gaps.copy()
     facing = np.zeros_like(apart)
     for at, outward in zip(position, normal, strict=True):
-        found, gaps = _face_to_face(at, outward)
+        found, gaps = _facing_mask(at, outward)
         facing |= found & apart
         np.minimum(least, gaps, out=least)
         np.maximum(most, gaps, out=most)
@@ -244,7 +246,7 @@ def can_oppose(hand: HandModel) -> bool:
     return False
 
 
-def _face_to_face(position: Floats, normal: Floats) -> tuple[np.ndarray, Floats]:
+def _facing_mask(position: Floats, normal: Floats) -> tuple[np.ndarray, Floats]:
     """Return a mask (N, N) of pairs of points that face each other over a gap, and the gaps [m]."""
     way = position[None] - position[:, None]
     gap = np.linalg.norm(way, axis=2)

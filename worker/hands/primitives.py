@@ -178,7 +178,7 @@ class HandFeatures:
         return len(self.body)
 
     @classmethod
-    def of(cls, pieces: tuple[ConvexPiece, ...]) -> HandFeatures:
+    def from_pieces(cls, pieces: tuple[ConvexPiece, ...]) -> HandFeatures:
         """Collect spheres, corners and edges of boxes and hulls, ends and axes of capsules, and rims."""
         rows: list[tuple[int, Floats, Floats, float]] = []
         edges: list[Floats] = [np.zeros((0, 2, 3))]

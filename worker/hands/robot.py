@@ -138,7 +138,7 @@ def _by_name(parts: Iterable[Any], duplicate: str) -> dict[str, Any]:
     return found
 
 
-def chain_to(robot: Robot, link: str) -> tuple[Joint, ...]:
+def joint_chain(robot: Robot, link: str) -> tuple[Joint, ...]:
     """Return the joints from the robot's root to a link."""
     carrier = {joint.child: joint for joint in robot.joints.values()}
     found: list[Joint] = []

@@ -46,7 +46,7 @@ def make_pieces(
     name = ""
     try:
         if shape.mesh is not None:
-            found = _hulls(*shape.mesh)
+            found = _reduced_hulls(*shape.mesh)
         else:
             name = find_mesh(shape.filename, files, base, link)
             key = (name, shape.size)
@@ -75,10 +75,10 @@ def _mesh_hulls(name: str, scale: tuple[float, ...], data: bytes, link: str) -> 
             f"collision mesh {name!r} of link {link!r} is {np.ptp(points, axis=0).max():.3g} m long; "
             'if it is in millimetres give it scale="0.001 0.001 0.001"'
         )
-    return _hulls(points, soup.faces.astype(np.int32))
+    return _reduced_hulls(points, soup.faces.astype(np.int32))
 
 
-def _hulls(points: Floats, faces: Ints) -> list[tuple[Floats, Ints]]:
+def _reduced_hulls(points: Floats, faces: Ints) -> list[tuple[Floats, Ints]]:
     # Hulls use all points of a file, including points that no face uses: `convex_parts` returns them for one hull.
     return [reduce_hull(part) for part in convex_parts(points, faces)]
 
@@ -87,11 +87,11 @@ def reduce_hull(points: Floats) -> tuple[Floats, Ints]:
     """Compute a hull of points (N, 3) with at most `MAX_HULL_VERTICES` corners and the full hull's volume.
     The corner farthest from the current hull is added repeatedly; then all are scaled about their centroid until the
     volumes agree. The surface error has both signs and half the size of an inscribed hull's error."""
-    made = cached_step("reduced hull", [points, np.array(MAX_HULL_VERTICES)], lambda: _reduce(points))
+    made = cached_step("reduced hull", [points, np.array(MAX_HULL_VERTICES)], lambda: _compute_reduced_hull(points))
     return made["0"], made["1"]
 
 
-def _reduce(points: Floats) -> tuple[Floats, Ints]:
+def _compute_reduced_hull(points: Floats) -> tuple[Floats, Ints]:
     vertices, faces = compute_hull(points)
     if len(vertices) <= MAX_HULL_VERTICES:
         return vertices, faces
@@ -193,11 +193,11 @@ def _decompose(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool]
 def _is_convex(vertices: Floats, faces: Ints) -> bool:
     """Check whether nearly all of the surface lies on the hull, so that no decomposition is needed."""
     normals, offsets = hull_planes(*hull(vertices[np.unique(faces)]))
-    depth = (offsets - _sample(vertices, faces) @ normals.T).min(axis=1)
+    depth = (offsets - _sample_surface(vertices, faces) @ normals.T).min(axis=1)
     return float(np.quantile(depth, _SHARE)) < _FLAT_M
 
 
-def _sample(vertices: Floats, faces: Ints) -> Floats:
+def _sample_surface(vertices: Floats, faces: Ints) -> Floats:
     areas = face_areas(vertices, faces)
     ladder = (np.arange(_POINTS) + 0.5) / _POINTS * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder), len(faces) - 1)
@@ -208,9 +208,9 @@ class _OpenSurface:
     """Points on a mesh with the directions in which each is visible from outside."""
 
     def __init__(self, vertices: Floats, faces: Ints) -> None:
-        corners, self._points = vertices[faces], _sample(vertices, faces)
+        corners, self._points = vertices[faces], _sample_surface(vertices, faces)
         # (D, P) whether a ray in a direction from a point misses the mesh.
-        self._sees = np.array([~_hits(self._points, direction, corners) for direction in _DIRECTIONS])
+        self._sees = np.array([~_hit_mask(self._points, direction, corners) for direction in _DIRECTIONS])
 
     def error(self, parts: tuple[Floats, ...]) -> float:
         """Return the ninth decile of the open surface's depth in the union of the parts [m]."""
@@ -224,7 +224,7 @@ class _OpenSurface:
         return float(np.quantile(shortest[reached], _SHARE))
 
 
-def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool_]:
+def _hit_mask(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool_]:
     """Return a mask (P,) of the rays that hit any triangle (F, 3, 3) (Moeller and Trumbore 1997)."""
     a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     across = np.cross(direction, second)

@@ -16,7 +16,7 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert
 from graspd.worker.hands import kinematics, primitives
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import ConvexPiece, HandModel, SurfacePoints
-from graspd.worker.objects.disk_cache import cached_arrays, content_of
+from graspd.worker.objects.disk_cache import cached_arrays, content_digest
 from graspd.worker.objects.memory_cache import cached_by_content
 
 #: Candidates per point. Thinning keeps one in five, evenly spread.
@@ -46,7 +46,7 @@ class _Shapes:
 
     @cached_property
     def content(self) -> str:
-        return content_of(self)
+        return content_digest(self)
 
 
 @cached_by_content(64)
@@ -59,11 +59,11 @@ def _cached_samples(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
 def _sample(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
     from scipy.spatial import cKDTree
 
-    bodies, candidates = len(shapes.rest), _candidates(shapes, max(OVERSAMPLING * count, MIN_CANDIDATES), seed)
+    bodies, candidates = len(shapes.rest), _exposed_points(shapes, max(OVERSAMPLING * count, MIN_CANDIDATES), seed)
     if len(candidates) < count:
         # Most of the surface is hidden inside other pieces: sample once more, in proportion.
         more = max(OVERSAMPLING * count, MIN_CANDIDATES) * count * OVERSAMPLING // max(len(candidates), 1)
-        candidates = _candidates(shapes, min(more, 5_000_000), seed)
+        candidates = _exposed_points(shapes, min(more, 5_000_000), seed)
     if len(candidates) < count:
         raise HandError(
             f"the outer surface of the hand gives {len(candidates)} points where {count} are needed: its pieces lie "
@@ -88,7 +88,7 @@ def _sample(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
     )
 
 
-def _candidates(hand: _Shapes, count: int, seed: int) -> SurfacePoints:
+def _exposed_points(hand: _Shapes, count: int, seed: int) -> SurfacePoints:
     """Return about `count` area-uniform points on the pieces, without buried ones."""
     rng = np.random.default_rng([seed, 0x5EED])
     shares = np.array([primitives.area(p.kind, p.size, p.vertices, p.faces) for p in hand.pieces])
@@ -98,7 +98,7 @@ def _candidates(hand: _Shapes, count: int, seed: int) -> SurfacePoints:
         vertices = _local_vertices(piece)
         local, direction = primitives.sample(piece.kind, piece.size, vertices, piece.faces, int(number), rng)
         position, normal = apply(piece.pose, local), quat_rotate(piece.pose[3:], direction)
-        keep = ~_is_buried(hand, i, position, normal)
+        keep = ~_buried_mask(hand, i, position, normal)
         body, area = np.full(len(keep), piece.body, np.int32), np.full(len(keep), shares[i] / number)
         parts.append((body[keep], position[keep], normal[keep], area[keep]))
     return SurfacePoints(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
@@ -114,7 +114,7 @@ def piece_distance(piece: ConvexPiece, points: Floats) -> Floats:
     return primitives.signed_distance(piece.kind, piece.size, _local_vertices(piece), piece.faces, local)
 
 
-def _is_buried(hand: _Shapes, own: int, position: Floats, normal: Floats) -> NDArray[np.bool_]:
+def _buried_mask(hand: _Shapes, own: int, position: Floats, normal: Floats) -> NDArray[np.bool_]:
     """Return a mask (N,) of points of piece `own` inside another piece or on a face of an earlier piece."""
     mine = hand.pieces[own]
     above, below = position + COINCIDENT_M * normal, position - COINCIDENT_M * normal

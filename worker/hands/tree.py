@@ -73,7 +73,7 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
         and joint.upper - joint.lower < LEAST_RANGE
     }
     fixed = still | options.fix
-    drives = {j.name: _resolve(j.name, mimics, fixed) for j in kept if j.type != "fixed"}
+    drives = {j.name: _resolve_drive(j.name, mimics, fixed) for j in kept if j.type != "fixed"}
     frozen = {name: drive for name, drive in drives.items() if isinstance(drive, float)}
     moving = {name: drive for name, drive in drives.items() if isinstance(drive, Mimic)}
     for name, drive in moving.items():
@@ -112,7 +112,7 @@ def _check_names(robot: Robot, options: HandOptions) -> None:
     check_tendons(robot, options.tendons or {})
 
 
-def _by_parent(joints: Iterable[Joint]) -> dict[str, list[Joint]]:
+def _joints_by_parent(joints: Iterable[Joint]) -> dict[str, list[Joint]]:
     found: dict[str, list[Joint]] = {}
     for joint in joints:
         found.setdefault(joint.parent, []).append(joint)
@@ -121,7 +121,7 @@ def _by_parent(joints: Iterable[Joint]) -> dict[str, list[Joint]]:
 
 def _hand_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
     """Return joints below the root and not below a dropped link, in the robot's order."""
-    children = _by_parent(robot.joints.values())
+    children = _joints_by_parent(robot.joints.values())
     kept: set[str] = set()
     stack = [root]
     while stack:
@@ -132,7 +132,7 @@ def _hand_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
     return [joint for joint in robot.joints.values() if joint.name in kept]
 
 
-def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, float]) -> Mimic | float:
+def _resolve_drive(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, float]) -> Mimic | float:
     """Return the drive of a joint through a chain of mimics, or its value if a fixed joint ends the chain."""
     multiplier, offset, at = 1.0, 0.0, name
     for _ in mimics:
@@ -148,14 +148,14 @@ def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, 
 
 
 def _fold_limits(dof: str, moving: dict[str, Mimic], robot: Robot, options: HandOptions) -> tuple[float, float]:
-    """Return a dof's range in which all its followers stay within their own limits; see `_limits_bind`."""
+    """Return a dof's range in which all followers stay within their limits; see `_has_binding_limits`."""
     lower, upper = -math.inf, math.inf
     narrowest = dof
     for name, drive in moving.items():
         if drive.joint != dof:
             continue
         joint = robot.joints[name]
-        if not _limits_bind(joint, drive, robot, options):
+        if not _has_binding_limits(joint, drive, robot, options):
             continue
         if joint.type == "prismatic" and joint.upper - joint.lower >= 2 * UNLIMITED_M:
             fault, fix = f"joint {name!r} slides without a range", f"give it a range, or fix it: --fix {name}=0"
@@ -186,17 +186,17 @@ def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Mimic]
             )
 
 
-def _limits_bind(joint: Joint, drive: Mimic, robot: Robot, options: HandOptions) -> bool:
+def _has_binding_limits(joint: Joint, drive: Mimic, robot: Robot, options: HandOptions) -> bool:
     """Check whether a joint's own limits bind; those of a URDF follower do not, see `Joint.mimic`."""
     return joint.name == drive.joint or robot.format != "URDF" or joint.name in options.couplings
 
 
-def exceeded_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
+def joints_beyond_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
     """Return the joints that follow another joint beyond their own limits, which do not bind them."""
     found = []
     for name in tree.joint_names:
         joint, drive = robot.joints[name], tree.drives[name]
-        if not _limits_bind(joint, drive, robot, options):
+        if not _has_binding_limits(joint, drive, robot, options):
             at = tree.dof_names.index(drive.joint)
             ends = sorted(drive.multiplier * end + drive.offset for end in (tree.lower[at], tree.upper[at]))
             if ends[0] < joint.lower - LEAST_RANGE or ends[1] > joint.upper + LEAST_RANGE:
@@ -204,7 +204,7 @@ def exceeded_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]
     return found
 
 
-def reduced_ranges(robot: Robot, tree: Tree) -> list[str]:
+def reduced_range_notes(robot: Robot, tree: Tree) -> list[str]:
     """Return notes on dofs whose range is reduced by their followers' limits."""
     return [
         f"joints that follow {dof} limit it to {lower:.3g} .. {upper:.3g}"
@@ -228,7 +228,7 @@ def _collect_bodies(
 ) -> tuple[tuple[Body, ...], dict[str, tuple[int, Floats]]]:
     """Collect bodies depth first; a link behind a fixed or frozen joint joins its parent's body."""
     bodies, links = [Body(root)], {root: (0, IDENTITY_POSE.copy())}
-    children = _by_parent(kept)
+    children = _joints_by_parent(kept)
     stack = children.get(root, [])[::-1]
     while stack:
         joint = stack.pop()
@@ -297,7 +297,7 @@ def hand_links(tree: _JointTree, root: str) -> list[str]:
         if tree.reach[link] <= MAX_FINGER_M and tree.has_shaped_branches(link):
             found.append(link)
         else:
-            queue += [joint.child for joint in tree.joints_onward(link)]
+            queue += [joint.child for joint in tree.moving_joints_below(link)]
     return found
 
 
@@ -306,7 +306,7 @@ class _JointTree:
 
     def __init__(self, robot: Robot, options: HandOptions) -> None:
         self.robot, self.options = robot, options
-        self._children = _by_parent(joint for joint in robot.joints.values() if joint.child not in options.drop)
+        self._children = _joints_by_parent(joint for joint in robot.joints.values() if joint.child not in options.drop)
         self._moves: dict[str, bool] = {}
         self.reach: dict[str, float] = {}
         """Length of the joints below each link, along the longest chain that moves [m]."""
@@ -333,12 +333,12 @@ class _JointTree:
     def is_free_below(self, joint: Joint) -> bool:
         return self.is_free(joint) or self._moves[joint.child]
 
-    def joints_onward(self, link: str) -> list[Joint]:
+    def moving_joints_below(self, link: str) -> list[Joint]:
         return [joint for joint in self._children.get(link, []) if self.is_free_below(joint)]
 
     def has_shaped_branches(self, link: str) -> bool:
         """Check whether at least two moving branches below a link have shapes."""
-        return sum(self._has_shape(joint.child) for joint in self.joints_onward(link)) > 1
+        return sum(self._has_shape(joint.child) for joint in self.moving_joints_below(link)) > 1
 
     def _has_shape(self, link: str) -> bool:
         below = (joint.child for joint in self._children.get(link, []))
@@ -350,7 +350,7 @@ def _link_below_arm(tree: _JointTree, root: str, options: HandOptions) -> str:
     start, at = root, root
     palm = options.palm.link if options.palm else None
     while at != palm:
-        onward = tree.joints_onward(at)
+        onward = tree.moving_joints_below(at)
         if len(onward) != 1:
             # A tree without branches is a single finger, so nothing above it is an arm.
             return start if onward else root

@@ -17,7 +17,7 @@ from defusedxml.common import DefusedXmlException
 
 from graspd.service.model.errors import HandError, LimitError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_from_axis_angle, quat_multiply
-from graspd.service.store.hand_files import text_of
+from graspd.service.store.hand_files import decode_text
 from graspd.worker.hands.robot import MAX_LENGTH_M, MOVING, UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
 
 MAX_BYTES: Final = 4 * 2**20
@@ -41,7 +41,7 @@ def _read_link(element: Element, materials: dict[str, Colour | None]) -> Link:
     name = _name(element, "link")
     shapes = tuple(_read_shape(collision, f"collision of link {name!r}") for collision in element.findall("collision"))
     mass_element = element.find("inertial/mass")
-    mass = None if mass_element is None else _number(mass_element, "value", f"mass of link {name!r}")
+    mass = None if mass_element is None else _parse_number(mass_element, "value", f"mass of link {name!r}")
     if mass is not None and mass < 0:
         raise HandError(f"mass of link {name!r} is negative; give it in kilograms")
     return Link(name, shapes, mass if mass else None, _read_visuals(element, name, materials))
@@ -78,16 +78,16 @@ def _read_shape(element: Element, what: str) -> Shape:
         raise HandError(f"{what} has no geometry; give a box, cylinder, sphere, capsule or mesh")
     match shape.tag:
         case "box":
-            size = _vector(shape, "size", what)
+            size = _parse_vector(shape, "size", what)
         case "sphere":
-            size = (_number(shape, "radius", what),)
+            size = (_parse_number(shape, "radius", what),)
         case "cylinder" | "capsule":
-            size = (_number(shape, "radius", what), _number(shape, "length", what))
+            size = (_parse_number(shape, "radius", what), _parse_number(shape, "length", what))
         case "mesh":
             filename = shape.get("filename", "")
             if not filename or len(filename) > 1000:
                 raise HandError(f"{what}: the mesh has no file name")
-            scale = _vector(shape, "scale", what, default=(1.0, 1.0, 1.0))
+            scale = _parse_vector(shape, "scale", what, default=(1.0, 1.0, 1.0))
             if not all(1e-6 <= abs(s) <= 1e6 for s in scale):
                 raise HandError(f"{what}: mesh scale {scale} is not usable; 0.001 turns millimetres into metres")
             return Shape("mesh", scale, pose, filename)
@@ -145,7 +145,7 @@ def _velocity_limit(element: Element) -> float:
 
 def _axis(element: Element, what: str, notes: list[str]) -> Floats:
     node = element.find("axis")
-    axis = np.array([1.0, 0, 0]) if node is None else np.array(_vector(node, "xyz", f"axis of {what}"))
+    axis = np.array([1.0, 0, 0]) if node is None else np.array(_parse_vector(node, "xyz", f"axis of {what}"))
     length = float(np.linalg.norm(axis))
     if length < 1e-9:
         raise HandError(f"{what}: the axis is zero; give a direction such as 0 0 1")
@@ -158,13 +158,13 @@ def _limits(element: Element, kind: str, what: str) -> tuple[float, float, float
     """Return lower and upper limit [rad or m] and effort [N m or N]; a continuous joint gets one turn."""
     limit = element.find("limit")
     if kind == "continuous":
-        effort = 0.0 if limit is None else _number(limit, "effort", f"limit of {what}", default=0.0)
+        effort = 0.0 if limit is None else _parse_number(limit, "effort", f"limit of {what}", default=0.0)
         return -math.pi, math.pi, abs(effort)
     if limit is None or (limit.get("lower") is None and limit.get("upper") is None):
         raise HandError(f'{what}: no <limit>; a {kind} joint needs <limit lower=".." upper=".." effort=".."/>')
-    lower = _number(limit, "lower", f"limit of {what}", default=0.0)
-    upper = _number(limit, "upper", f"limit of {what}", default=0.0)
-    effort = abs(_number(limit, "effort", f"limit of {what}", default=0.0))
+    lower = _parse_number(limit, "lower", f"limit of {what}", default=0.0)
+    upper = _parse_number(limit, "upper", f"limit of {what}", default=0.0)
+    effort = abs(_parse_number(limit, "effort", f"limit of {what}", default=0.0))
     if lower > upper:
         raise HandError(f"{what}: lower limit {lower:g} lies above the upper limit {upper:g}; exchange them")
     if max(abs(lower), abs(upper)) > (4 * math.pi if kind == "revolute" else MAX_LENGTH_M):
@@ -176,8 +176,8 @@ def _mimic(element: Element, what: str) -> Mimic | None:
     node = element.find("mimic")
     if node is None:
         return None
-    multiplier = _number(node, "multiplier", f"mimic of {what}", default=1.0)
-    offset = _number(node, "offset", f"mimic of {what}", default=0.0)
+    multiplier = _parse_number(node, "multiplier", f"mimic of {what}", default=1.0)
+    offset = _parse_number(node, "offset", f"mimic of {what}", default=0.0)
     return Mimic(node.get("joint", ""), multiplier, offset)
 
 
@@ -188,7 +188,7 @@ def _name(element: Element, what: str) -> str:
     return name
 
 
-def _number(element: Element, key: str, what: str, default: float | None = None) -> float:
+def _parse_number(element: Element, key: str, what: str, default: float | None = None) -> float:
     text = element.get(key)
     if text is None and default is not None:
         return default
@@ -201,7 +201,7 @@ def _number(element: Element, key: str, what: str, default: float | None = None)
     return value
 
 
-def _vector(element: Element, key: str, what: str, default: tuple[float, ...] | None = None) -> tuple[float, ...]:
+def _parse_vector(element: Element, key: str, what: str, default: tuple[float, ...] | None = None) -> tuple[float, ...]:
     text = element.get(key)
     if text is None and default is not None:
         return default
@@ -218,8 +218,8 @@ def _origin(element: Element, what: str) -> Floats:
     node = element.find("origin")
     if node is None:
         return IDENTITY_POSE.copy()
-    xyz = _vector(node, "xyz", f"origin of {what}", default=(0.0, 0.0, 0.0))
-    rpy = _vector(node, "rpy", f"origin of {what}", default=(0.0, 0.0, 0.0))
+    xyz = _parse_vector(node, "xyz", f"origin of {what}", default=(0.0, 0.0, 0.0))
+    rpy = _parse_vector(node, "rpy", f"origin of {what}", default=(0.0, 0.0, 0.0))
     if max(map(abs, xyz)) > MAX_LENGTH_M:
         raise HandError(f"origin of {what} lies {max(map(abs, xyz)):g} m away; URDF lengths are metres")
     # Rotations about the fixed axes x, then y, then z.
@@ -238,7 +238,7 @@ def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_b
     Raises HandError: empty, not XML, or another root than `root` (`what` in the message). LimitError: larger."""
     if len(data) > limit_bytes:
         raise LimitError(f"{name}: {len(data)} bytes of XML; at most {limit_bytes} are taken")
-    text = text_of(data)
+    text = decode_text(data)
     if not text:
         raise HandError(f"{name} is empty; export it again")
     try:

@@ -15,7 +15,13 @@ import numpy as np
 
 from graspd.service.model.errors import HandError, InputError
 from graspd.service.model.transforms import Floats, apply
-from graspd.service.store.mesh_files import MAX_NAMES, appearance_files, match_name, read_reference, resolve
+from graspd.service.store.mesh_files import (
+    MAX_NAMES,
+    appearance_files,
+    match_name,
+    resolve_appearance_file,
+    resolve_mesh_reference,
+)
 from graspd.worker.hands.primitives import tessellate
 from graspd.worker.hands.robot import Ints, Shape
 from graspd.worker.objects.formats import Nearby, Soup, read_mesh
@@ -75,7 +81,7 @@ class Visuals:
         soups: dict[str, Soup] = {}
         left = MAX_FACES
         for item in self.placed:
-            for mesh in _meshes(item, self.files, self.base, soups):
+            for mesh in _visual_meshes(item, self.files, self.base, soups):
                 left -= len(mesh.faces)
                 if left >= 0:
                     found.append(mesh)
@@ -103,7 +109,9 @@ def merge_and_thin(vertices: Floats, faces: Ints, share: Callable[[int], float])
     return np.asarray(points, float), np.asarray(triangles, np.int32)
 
 
-def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dict[str, Soup]) -> list[VisualMesh]:
+def _visual_meshes(
+    item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dict[str, Soup]
+) -> list[VisualMesh]:
     shape = item.shape
     if shape.kind != "mesh":
         vertices, faces = tessellate(shape.kind, shape.size)
@@ -115,7 +123,7 @@ def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dic
         return []
     try:
         if name not in soups:
-            soups[name] = read_mesh(name, files[name], _mesh_files(name, files))
+            soups[name] = read_mesh(name, files[name], _file_lookup(name, files))
     except InputError:
         return []
     soup, scale = soups[name], np.asarray(shape.size)
@@ -128,14 +136,14 @@ def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dic
     return found
 
 
-def _mesh_files(mesh: str, files: Mapping[str, bytes]) -> Nearby:
+def _file_lookup(mesh: str, files: Mapping[str, bytes]) -> Nearby:
     """Return a lookup of the hand's files that a mesh and its material libraries name, up to `MAX_NAMES`."""
     naming, lookups = [mesh], count()
 
     def find(reference: str) -> bytes | None:
         if next(lookups) >= MAX_NAMES:
             return None
-        found = (resolve(one, reference, files.__contains__) for one in reversed(naming))
+        found = (resolve_appearance_file(one, reference, files.__contains__) for one in reversed(naming))
         if (name := next(filter(None, found), None)) is None:
             return None
         if name.lower().endswith(".mtl"):
@@ -153,11 +161,11 @@ def _file_of(item: PlacedShape, files: Mapping[str, bytes], base: str) -> str:
 
 
 def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
-    """Return the name in `files` of a mesh that a URDF references; see `read_reference`.
+    """Return the name in `files` of a mesh that a URDF references; see `resolve_mesh_reference`.
     Without an exact match, return the only file whose path has the same end, else one whose path differs in case.
     Raises HandError: the mesh is missing, or lies outside the upload."""
     try:
-        reference = read_reference(filename, base)
+        reference = resolve_mesh_reference(filename, base)
     except InputError as error:
         raise HandError(f"mesh {filename!r} of link {link!r} {error}") from None
     for name in reference.names:

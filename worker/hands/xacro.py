@@ -15,7 +15,7 @@ from pathlib import PurePosixPath
 from typing import Final
 
 from graspd.service.model.errors import HandError
-from graspd.service.store.hand_files import format_of, text_of
+from graspd.service.store.hand_files import decode_text, format_of
 from graspd.worker.hands.robot import Robot
 from graspd.worker.hands.urdf import MAX_BYTES, read_urdf
 from graspd.worker.objects.format_check import check_format
@@ -40,7 +40,9 @@ def expand_xacro(files: Mapping[str, bytes], main: str, arguments: Mapping[str, 
         "memory": MEMORY_LIMIT_BYTES,
         "cpu": CPU_LIMIT_S,
         "limit": MAX_BYTES,
-        "texts": {name: text_of(files[name]) for name in sorted(files) if PurePosixPath(name).suffix.lower() in _READ},
+        "texts": {
+            name: decode_text(files[name]) for name in sorted(files) if PurePosixPath(name).suffix.lower() in _READ
+        },
     }
     passed_on = {name: os.environ[name] for name in ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH") if name in os.environ}
     try:

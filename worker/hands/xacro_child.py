@@ -67,7 +67,7 @@ def _expand(given: dict[str, Any]) -> str:
 
     texts: dict[str, str] = given["texts"]
 
-    def named(path: str) -> str:
+    def resolve_file(path: str) -> str:
         inside = posixpath.normpath(posixpath.join(_TOP, path.replace("\\", "/")))
         if not inside.startswith(_TOP + "/"):
             name = path.removeprefix(_TOP + "/")
@@ -75,7 +75,7 @@ def _expand(given: dict[str, Any]) -> str:
         return inside.removeprefix(_TOP + "/")
 
     def text_of(path: str) -> str:
-        name = named(path)
+        name = resolve_file(path)
         name = name if name in texts else match_name(name, texts) or name
         if name in texts and texts[name].startswith("version https://git-lfs."):
             raise Refused(f"includes {name!r}, which is a Git LFS pointer, not the file itself: git lfs pull")
@@ -87,7 +87,7 @@ def _expand(given: dict[str, Any]) -> str:
         return safe.parseString(text_of(str(filename)) if source is None else source)
 
     def find(package: str) -> str:
-        folder = _package(package, given["names"], texts)
+        folder = _find_package(package, given["names"], texts)
         if folder is None:
             raise Refused(f"needs the package {package!r}; give the folder that holds both: --urdf NAME")
         return posixpath.join(_TOP, folder)
@@ -98,17 +98,17 @@ def _expand(given: dict[str, Any]) -> str:
     def evaluate(expression: str, symbols: dict[str, Any], scope: Any = None) -> Any:
         # `symbols` itself is changed: a copy would lack the enclosing scopes.
         symbols.update(__builtins__={})
-        return eval(_checked(expression), symbols, scope)
+        return eval(_compile_checked(expression), symbols, scope)
 
     def substitute(expression: str, context: dict[str, Any]) -> str:
         values = {**_PLAIN, **{k: v for k, v in vars(xacro.math).items() if not k.startswith("_")}}
         values |= {k: substitution_args.convert_value(str(v), "auto") for k, v in context.get("arg", {}).items()}
         values |= {"find": find, "arg": lambda name: values[name], "dirname": lambda: _TOP}
-        return str(eval(_checked(expression), {"__builtins__": {}}, values))
+        return str(eval(_compile_checked(expression), {"__builtins__": {}}, values))
 
     xacro.parse, xacro.safe_eval = parse, evaluate
     xacro.open = lambda path, *_: io.StringIO(text_of(path))
-    pattern_of = lambda pattern: [f"{_TOP}/{n}" for n in fnmatch.filter(texts, named(pattern))]  # noqa: E731
+    pattern_of = lambda pattern: [f"{_TOP}/{n}" for n in fnmatch.filter(texts, resolve_file(pattern))]  # noqa: E731
     xacro.glob = SimpleNamespace(glob=pattern_of)
     substitution_args._eval, substitution_args._eval_find = substitute, find
     substitution_args._eval_env = substitution_args._eval_dict["env"] = environment
@@ -138,7 +138,7 @@ _PLAIN: Final[dict[str, Any]] = {"true": True, "false": False, "True": True, "Fa
 }
 
 
-def _checked(expression: str) -> Any:
+def _compile_checked(expression: str) -> Any:
     """Compile an expression; raise Refused if it has forbidden names or more than `_MAX_NODES` nodes."""
     tree = ast.parse(expression.strip(), "<expression>", "eval")
     for count, node in enumerate(ast.walk(tree)):
@@ -150,7 +150,7 @@ def _checked(expression: str) -> Any:
     return compile(tree, "<expression>", "eval")
 
 
-def _package(package: str, names: list[str], texts: dict[str, str]) -> str | None:
+def _find_package(package: str, names: list[str], texts: dict[str, str]) -> str | None:
     """Find the folder of a ROS package by manifest, else by name; return its path relative to the top."""
     for name, text in texts.items():
         if posixpath.basename(name) == "package.xml" and f"<name>{package}</name>" in "".join(text.split()):
@@ -172,10 +172,10 @@ def _restrict_process(cpu_s: int, memory_bytes: int) -> None:
     limits = {"AS": memory_bytes, "CORE": 0, "FSIZE": 0, "NOFILE": 3}
     for what, value in limits.items():
         resource.setrlimit(getattr(resource, f"RLIMIT_{what}"), (value, value))
-    sys.addaudithook(_refuse)
+    sys.addaudithook(_refuse_event)
 
 
-def _refuse(event: str, _arguments: tuple[Any, ...]) -> None:
+def _refuse_event(event: str, _arguments: tuple[Any, ...]) -> None:
     if event not in _HARMLESS:
         raise Refused(f"it reaches out of its folder ({event}); expand it yourself and give the URDF")
 

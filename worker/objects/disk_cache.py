@@ -42,7 +42,7 @@ def cached_arrays(
     """Load arrays from a folder of the user's cache, or compute and cache them; both give the same bits.
     `terms` and the modules `code` must contain everything that determines the arrays. Errors of `make` are not cached.
     Loaded arrays for which `fits` returns False are recomputed."""
-    file = _file(kind, terms, code)
+    file = _cache_file(kind, terms, code)
     if (held := _read(file)) is not None and fits(held):
         return held
     made = make()
@@ -54,7 +54,7 @@ def cached_arrays(
 def caching_steps(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Iterator[None]:
     """Cache the results of `cached_step` inside this context in one entry, and load them the next time.
     Only small steps that need a slowly loading library gain by this. The terms only distinguish entries."""
-    file = _file(kind, terms, code)
+    file = _cache_file(kind, terms, code)
     known = _read(file) or {}
     now = dict(known)
     token = _recalled.set(now)
@@ -83,8 +83,8 @@ def cached_step(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Seq
     return found
 
 
-def _file(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Path:
-    address = digest_json([*terms, revision(tuple(str(module.__file__) for module in code), _LIBRARIES)])
+def _cache_file(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Path:
+    address = digest_json([*terms, code_revision(tuple(str(module.__file__) for module in code), _LIBRARIES)])
     return user_cache.cache_folder(kind) / f"{address}.npz"
 
 
@@ -105,7 +105,7 @@ def _write(file: Path, arrays: Arrays) -> None:
 
 
 @lru_cache(maxsize=16)
-def revision(files: tuple[str, ...], libraries: tuple[str, ...]) -> str:
+def code_revision(files: tuple[str, ...], libraries: tuple[str, ...]) -> str:
     """Compute a digest of source files, libraries, and the processor type, which may affect the last bits."""
     whole = hashlib.sha256(b"".join(Path(file).read_bytes() for file in files))
     return digest_json([whole.hexdigest(), *map(version_of, libraries), platform.machine()])
@@ -113,17 +113,17 @@ def revision(files: tuple[str, ...], libraries: tuple[str, ...]) -> str:
 
 #: A model's name does not affect its content.
 _NAMES: Final = frozenset({"name", "digest"})
-#: Metadata of a field that `content_of` ignores while it has its default.
+#: Metadata of a field that `content_digest` ignores while it has its default.
 TOLD_IF_SET: Final = MappingProxyType({"told_if_set": True})
 #: Metadata of a field that `content_of` ignores.
 NOT_CONTENT: Final = MappingProxyType({"not_content": True})
 
 
-def content_of(model: Any) -> str:
+def content_digest(model: Any) -> str:
     """Compute a digest of a dataclass without its name and its files' digest; arrays count bit for bit.
     Raises TypeError: a field is no number, string, array, tuple or set of these, nor a dataclass."""
     whole = hashlib.sha256()
-    for part in _parts({name: value for name, value in _digest_fields(model).items() if name not in _NAMES}):
+    for part in _digest_parts({name: value for name, value in _digest_fields(model).items() if name not in _NAMES}):
         whole.update(len(part).to_bytes(8, "little"))
         whole.update(part)
     return whole.hexdigest()[:32]
@@ -139,22 +139,22 @@ def _digest_fields(model: Any) -> dict[str, Any]:
     }
 
 
-def _parts(value: Any) -> Iterator[bytes]:
+def _digest_parts(value: Any) -> Iterator[bytes]:
     if isinstance(value, np.ndarray):
         yield f"{value.dtype.str}{value.shape}".encode()
         yield np.ascontiguousarray(value).tobytes()
     elif isinstance(value, dict):
         for key, held in value.items():
             yield str(key).encode()
-            yield from _parts(held)
+            yield from _digest_parts(held)
     elif isinstance(value, (tuple, frozenset)):
         yield f"{type(value).__name__}{len(value)}".encode()
         for held in sorted(value) if isinstance(value, frozenset) else value:
-            yield from _parts(held)
+            yield from _digest_parts(held)
     elif is_dataclass(value) and isinstance(digest := getattr(value, "content", None), str):
         yield digest.encode()
     elif is_dataclass(value) and not isinstance(value, type):
-        yield from _parts(_digest_fields(value))
+        yield from _digest_parts(_digest_fields(value))
     elif isinstance(value, (str, int, float, np.generic)) or value is None:
         yield f"{type(value).__name__}{value!r}".encode()
     else:

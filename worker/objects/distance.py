@@ -107,7 +107,9 @@ def point_triangle_distance(points: Floats, triangles: Floats) -> Floats:
     a, b, c = triangles[..., 0, :], triangles[..., 1, :], triangles[..., 2, :]
     normal = np.cross(b - a, c - a)
     square = np.einsum("...i,...i", normal, normal)
-    sides = np.minimum(np.minimum(_segment(points, a, b), _segment(points, b, c)), _segment(points, c, a))
+    sides = np.minimum(
+        np.minimum(_segment_distance(points, a, b), _segment_distance(points, b, c)), _segment_distance(points, c, a)
+    )
     relative = points - a
     height = np.einsum("...i,...i", relative, normal)
     v = np.einsum("...i,...i", np.cross(relative, c - a), normal)
@@ -117,7 +119,7 @@ def point_triangle_distance(points: Floats, triangles: Floats) -> Floats:
     return np.where(inside, plane, sides)
 
 
-def _segment(points: Floats, start: Floats, end: Floats) -> Floats:
+def _segment_distance(points: Floats, start: Floats, end: Floats) -> Floats:
     along = end - start
     length = np.maximum(np.einsum("...i,...i", along, along), 1e-300)
     t = np.clip(np.einsum("...i,...i", points - start, along) / length, 0, 1)

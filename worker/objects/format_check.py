@@ -68,7 +68,7 @@ def check_format(name: str, data: bytes, error: type[InputError]) -> None:
         raise error(f"{name} is a ZIP archive, not the file itself: unpack it, or name it .zip")
 
 
-def true_format(name: str, data: bytes) -> str | None:
+def format_hint(name: str, data: bytes) -> str | None:
     """Return the true mesh format of a file that its reader refuses, and the fix; None if unknown."""
     own, head = PurePosixPath(name).suffix.lower(), data[:4096].lstrip()
     for suffix, pattern in _MESHES.items():

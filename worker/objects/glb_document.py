@@ -47,20 +47,20 @@ class Document:
         quantised: Any = {"byteStride": 4}, {"normalized": True}
         attributes = {
             "POSITION": self.add_vectors(vertices[unique[:, 0]]),
-            "NORMAL": self._accessor(padded, _BYTE, "VEC3", _ARRAY, *quantised),
+            "NORMAL": self._add_accessor(padded, _BYTE, "VEC3", _ARRAY, *quantised),
         }
         if face_colours is not None:
             tinted = np.zeros((len(unique), 4), np.uint8)
             tinted[:, :3] = unique[:, 4:]
-            attributes["COLOR_0"] = self._accessor(tinted, _UBYTE, "VEC3", _ARRAY, *quantised)
-        indices = self._accessor(index.reshape(-1).astype(np.uint32), _U32, "SCALAR", _ELEMENTS, {}, {})
+            attributes["COLOR_0"] = self._add_accessor(tinted, _UBYTE, "VEC3", _ARRAY, *quantised)
+        indices = self._add_accessor(index.reshape(-1).astype(np.uint32), _U32, "SCALAR", _ELEMENTS, {}, {})
         primitive: dict[str, Any] = {"attributes": attributes, "indices": indices}
-        return primitive if colour is None else primitive | {"material": self._material(colour)}
+        return primitive if colour is None else primitive | {"material": self._add_material(colour)}
 
     def add_points(self, values: NDArray[Any]) -> dict[str, Any]:
         return {"attributes": {"POSITION": self.add_vectors(values)}, "mode": _POINTS}
 
-    def _material(self, colour: tuple[float, float, float]) -> int:
+    def _add_material(self, colour: tuple[float, float, float]) -> int:
         look = {"baseColorFactor": [*rounded_values(colour), 1.0], "metallicFactor": 0.1, "roughnessFactor": 0.6}
         material = {"pbrMetallicRoughness": look, "doubleSided": True}
         if material not in self._materials:
@@ -70,7 +70,7 @@ class Document:
     def add_vectors(self, values: NDArray[Any]) -> int:
         data = np.ascontiguousarray(values, np.float32)
         bounds = {"min": data.min(axis=0).tolist(), "max": data.max(axis=0).tolist()}
-        return self._accessor(data, _FLOAT, "VEC3", _ARRAY, {}, bounds)
+        return self._add_accessor(data, _FLOAT, "VEC3", _ARRAY, {}, bounds)
 
     def add_mesh(self, primitives: list[dict[str, Any]]) -> int:
         self._meshes.append({"primitives": primitives})
@@ -97,7 +97,7 @@ class Document:
         parts = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
         return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
 
-    def _accessor(
+    def _add_accessor(
         self, data: NDArray[Any], component: int, kind: str, target: int, view: dict[str, Any], facts: dict[str, Any]
     ) -> int:
         chunk = data.tobytes()

@@ -47,32 +47,32 @@ def intersecting_faces(vertices: Floats, faces: Indices) -> Indices | None:
     if tree.count_neighbors(tree, 2 * radius) > 2 * MAX_PAIRS:
         return None
     near = owner[tree.query_pairs(2 * radius, output_type="ndarray")]
-    near = _distinct(near[(near[:, 0] != near[:, 1]) & _boxes_meet(corners, near)], len(faces))
+    near = _unique_pairs(near[(near[:, 0] != near[:, 1]) & _box_overlap_mask(corners, near)], len(faces))
     apart = ~(faces[near[:, 0]][:, :, None] == faces[near[:, 1]][:, None, :]).any(axis=(1, 2))
     near = near[apart]
     depth = DEPTH * float(np.ptp(vertices, axis=0).max())
     found = [
-        _edges_pass(corners[part[:, 0]], corners[part[:, 1]], depth)
-        | _edges_pass(corners[part[:, 1]], corners[part[:, 0]], depth)
+        _edge_crossing_mask(corners[part[:, 0]], corners[part[:, 1]], depth)
+        | _edge_crossing_mask(corners[part[:, 1]], corners[part[:, 0]], depth)
         for part in np.array_split(near, max(1, len(near) // _CHUNK))
     ]
     return near[np.concatenate(found)]
 
 
-def _distinct(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+def _unique_pairs(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     """Return unordered pairs (P, 2) of numbers below `count` once each, in ascending order.
     Pairs encoded as one number sort many times faster than rows."""
     keys = np.unique(pairs.min(axis=1) * np.int64(count) + pairs.max(axis=1))
     return np.stack(np.divmod(keys, count), axis=1)
 
 
-def _boxes_meet(corners: Floats, pairs: Indices) -> NDArray[np.bool_]:
+def _box_overlap_mask(corners: Floats, pairs: Indices) -> NDArray[np.bool_]:
     low, high = corners.min(axis=1), corners.max(axis=1)
     one, other = pairs.T
     return np.asarray(((low[one] <= high[other]) & (low[other] <= high[one])).all(axis=1))
 
 
-def _edges_pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_]:
+def _edge_crossing_mask(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_]:
     """Return a mask (P,): an edge of one triangle (P, 3, 3) passes `depth` [m] deep through the other."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
@@ -92,7 +92,7 @@ def _edges_pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np
     return hit
 
 
-def untangle(vertices: Floats, faces: Indices) -> Mesh | None:
+def unite_self_overlaps(vertices: Floats, faces: Indices) -> Mesh | None:
     """Return the solid in which doubly enclosed volume counts once; None if this is not safe.
     The mesh is halved until no piece intersects itself, and the pieces are united; no vertex moves. This is safe if the
     result is closed and free of crossings, and all of its surface lies on the old surface."""

@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from cachetools import LRUCache
 
-from graspd.worker.objects.disk_cache import content_of
+from graspd.worker.objects.disk_cache import content_digest
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -29,7 +29,7 @@ def cached_by_content(size: int) -> Callable[[Callable[P, T]], Callable[P, T]]:
         def call(*args: P.args, **kwargs: P.kwargs) -> T:
             given = signature.bind(*args, **kwargs)
             given.apply_defaults()
-            key = tuple(map(_content, given.arguments.values()))
+            key = tuple(map(_hashable_content, given.arguments.values()))
             with lock:
                 if key not in known:
                     known[key] = make(*args, **kwargs)
@@ -40,11 +40,11 @@ def cached_by_content(size: int) -> Callable[[Callable[P, T]], Callable[P, T]]:
     return decorate
 
 
-def _content(value: Any) -> Hashable:
+def _hashable_content(value: Any) -> Hashable:
     if isinstance(value, np.ndarray):
         return value.tobytes()
     if isinstance(value, (list, tuple)):
-        return tuple(map(_content, value))
+        return tuple(map(_hashable_content, value))
     if not is_dataclass(value):
         return value
-    return getattr(value, "content", None) or content_of(value)
+    return getattr(value, "content", None) or content_digest(value)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.grasps import move_poses
 from graspd.worker.objects.model import Ints
-from graspd.worker.objects.topology import FaceIndices, Indices, face_vectors, parts_of_graph
+from graspd.worker.objects.topology import FaceIndices, Indices, connected_parts, face_vectors
 
 
 @dataclass(frozen=True)
@@ -130,15 +130,15 @@ def group_solids(pieces: list[Any], gap: float) -> list[list[Any]]:
         (i, j)
         for i, piece in enumerate(pieces)
         for j in (i + 1 + np.flatnonzero(_box_separation(low, high, i) <= gap * (1 + _ROUNDING))).tolist()
-        if piece.min_gap(pieces[j], 2 * gap) <= gap * (1 + _ROUNDING) and not _nested(piece, pieces[j])
+        if piece.min_gap(pieces[j], 2 * gap) <= gap * (1 + _ROUNDING) and not _is_nested(piece, pieces[j])
     ]
     one, other = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-    label = parts_of_graph(one, other, len(pieces))
+    label = connected_parts(one, other, len(pieces))
     found = [[pieces[i] for i in np.flatnonzero(label == k)] for k in range(label.max() + 1)]
     return sorted(found, key=lambda group: -sum(piece.volume() for piece in group))
 
 
-def _nested(a: Any, b: Any) -> bool:
+def _is_nested(a: Any, b: Any) -> bool:
     """Check whether one of two outer shells contains the other shell, loose in a cavity."""
     small, large = sorted((a, b), key=lambda one: float(one.volume()))
     return bool((small - large).is_empty())

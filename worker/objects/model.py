@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import MeshError
 from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG
 from graspd.service.model.transforms import Floats
-from graspd.worker.objects.disk_cache import NOT_CONTENT, TOLD_IF_SET, content_of
+from graspd.worker.objects.disk_cache import NOT_CONTENT, TOLD_IF_SET, content_digest
 from graspd.worker.objects.parts import SurfaceParts
 
 Ints = NDArray[np.int32]
@@ -48,7 +48,7 @@ class ObjectModel:
     @cached_property
     def content(self) -> str:
         """Digest of the prepared model; `digest` is that of the file, equal for every fidelity."""
-        return content_of(self)
+        return content_digest(self)
 
     @property
     def centred(self) -> ObjectModel:

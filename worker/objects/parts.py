@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from graspd.service.model.contact_region import RegionSpec
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
-from graspd.worker.objects.disk_cache import content_of
+from graspd.worker.objects.disk_cache import content_digest
 from graspd.worker.objects.distance import sample_faces
 from graspd.worker.objects.formats import Soup
 from graspd.worker.objects.memory_cache import cached_by_content
@@ -43,7 +43,7 @@ class SurfaceParts:
 
     @cached_property
     def content(self) -> str:
-        return content_of(self)
+        return content_digest(self)
 
     @property
     def listed(self) -> list[str]:
@@ -94,7 +94,7 @@ class Voxels:
 
     @cached_property
     def content(self) -> str:
-        return content_of(self)
+        return content_digest(self)
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
         """Return a mask (...) of the points (..., 3) in the region."""

@@ -49,7 +49,7 @@ def load_object(
     settings = parse_options(files, options)
     main = main_file(files, settings)
     shape = settings.model_dump_json(exclude=set(OF_MATTER))
-    model = replace(_prepared(main, files[main], shape, float(face_error_m)), name=name, digest=digest)
+    model = replace(_prepare(main, files[main], shape, float(face_error_m)), name=name, digest=digest)
     return apply_options(model, settings)
 
 
@@ -73,7 +73,7 @@ def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
 
 
 @lru_cache(maxsize=8)
-def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) -> ObjectModel:
+def _prepare(main: str, data: bytes, options_json: str, face_error_m: float) -> ObjectModel:
     """Prepare an object; cached in memory and on disk for batches of a job and repeated commands."""
     terms = [Path(main).suffix.lower(), options_json, repr(face_error_m), hashlib.sha256(data).hexdigest(), revision()]
     file = user_cache.cache_folder("objects") / f"{digest_json(terms)}.npz"
@@ -87,11 +87,11 @@ def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) ->
 
 def repaired_mesh(main: str, data: bytes, options: ObjectOptions) -> RepairedMesh:
     """Return the mesh of a file as a solid in metres; errors name the file."""
-    return _repaired(main, data, options.model_dump_json())
+    return _repair_file(main, data, options.model_dump_json())
 
 
 @lru_cache(maxsize=2)
-def _repaired(main: str, data: bytes, options_json: str) -> RepairedMesh:
+def _repair_file(main: str, data: bytes, options_json: str) -> RepairedMesh:
     """Repair, cached: the result is reused for every value of `face_error_m`."""
     soup = read_mesh(main, data)
     try:
@@ -160,11 +160,11 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
         return path.stem, unpack_file(path), {}
     files, beside = {path.name: path.read_bytes()}, path.with_name("asset.json")
     if not beside.is_file():
-        return name_of(path), files, {}
-    return name_of(path), files | {beside.name: beside.read_bytes()}, {"file": path.name}
+        return object_name(path), files, {}
+    return object_name(path), files | {beside.name: beside.read_bytes()}, {"file": path.name}
 
 
-def name_of(path: Path) -> str:
+def object_name(path: Path) -> str:
     """Return an object's name: that of its mesh file, or of the folder if the file name is generic."""
     return path.resolve().parent.name if path.stem.lower() in PLAIN_STEMS else path.stem
 
@@ -172,7 +172,7 @@ def name_of(path: Path) -> str:
 @lru_cache(maxsize=1)
 def revision() -> str:
     """Compute a digest of this package and its libraries, so that a change invalidates cached objects."""
-    return disk_cache.revision(tuple(map(str, sorted(Path(__file__).parent.rglob("*.py")))), _LIBRARIES)
+    return disk_cache.code_revision(tuple(map(str, sorted(Path(__file__).parent.rglob("*.py")))), _LIBRARIES)
 
 
 Mesh = tuple[Floats, Indices]
@@ -203,20 +203,20 @@ def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool =
     original = ReferenceMesh(vertices, faces, closed)
     if len(faces) > MANY_FACES:
         # A mesh within a fifth of the error is quick to compare with: four fifths remain for the trials.
-        start = _simplified(original, MANY_FACES, limit / 5)
+        start = _simplify_to(original, MANY_FACES, limit / 5)
         if start is not None:
             original, limit = ReferenceMesh(*start, closed), limit * 4 / 5
     accepted: list[Mesh] = []
     low, high = float(FEW_FACES), float(len(original.faces))
     while high / low > STEP:
         target = round(math.sqrt(low * high))
-        if (trial := _simplified(original, target, limit)) is None:
+        if (trial := _simplify_to(original, target, limit)) is None:
             low = target
         else:
             high = target
             accepted.append(trial)
     if not accepted and closed:
-        accepted = _thin_variants(original, limit)
+        accepted = _simplify_by_manifold(original, limit)
     for mesh in reversed(accepted):
         error = deviation(mesh, (vertices, faces), DENSE_SAMPLES)
         if error <= error_m:
@@ -233,7 +233,7 @@ class ReferenceMesh:
         self._distance = MeshDistance(vertices, faces)
         self._points = surface_points(vertices, faces, SAMPLES)
 
-    def accepts(self, mesh: Mesh) -> bool:
+    def is_matched_by(self, mesh: Mesh) -> bool:
         """Check whether a mesh is closed, outward, and of as many shells as a closed original."""
         return not self.closed or (
             topology.is_closed(mesh[1])
@@ -253,12 +253,12 @@ class ReferenceMesh:
         )
 
 
-def _simplified(original: ReferenceMesh, target: int, error_m: float) -> Mesh | None:
+def _simplify_to(original: ReferenceMesh, target: int, error_m: float) -> Mesh | None:
     """Return a mesh of about `target` faces if it is valid and within the bound.
     A collapse that breaks the surface at one number of faces often succeeds at the next, so a few numbers are used."""
     for count in (target, int(target * 1.02) + 2, int(target * 1.05) + 4):
         mesh = _collapse(original.vertices, original.faces, count)
-        if mesh is not None and original.accepts(mesh):
+        if mesh is not None and original.is_matched_by(mesh):
             return mesh if original.is_within(mesh, error_m) else None
     return None
 
@@ -281,17 +281,17 @@ def _collapse(vertices: Floats, faces: Indices, target: int) -> Mesh | None:
     mesh = topology.drop_unused_vertices(np.asarray(points, dtype=float) * scale + middle, triangles)
     if (topology.edge_faces(mesh[1])[1] > 2).any():
         # A tunnel that collapsed to an edge is closed by splitting the edge.
-        mesh = topology.part_double_edges(*topology.split_edges(*mesh))
+        mesh = topology.separate_double_edges(*topology.split_edges(*mesh))
     return mesh
 
 
-def _thin_variants(original: ReferenceMesh, error_m: float) -> list[Mesh]:
+def _simplify_by_manifold(original: ReferenceMesh, error_m: float) -> list[Mesh]:
     whole = mesh_geometry.to_manifold(original.vertices, original.faces)
     if whole is None:
         return []
     for share in (0.9, 0.5, 0.2):
         mesh = mesh_geometry.from_manifold(whole.simplify(share * error_m))
-        if len(mesh[1]) < len(original.faces) and original.accepts(mesh) and original.is_within(mesh, error_m):
+        if len(mesh[1]) < len(original.faces) and original.is_matched_by(mesh) and original.is_within(mesh, error_m):
             return [mesh]
     return []
 

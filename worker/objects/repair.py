@@ -17,7 +17,7 @@ from graspd.worker.grasps import round_to_grid
 from graspd.worker.objects import mesh_geometry, topology
 from graspd.worker.objects.distance import MeshDistance, surface_points
 from graspd.worker.objects.formats import Soup
-from graspd.worker.objects.intersections import intersecting_faces, untangle
+from graspd.worker.objects.intersections import intersecting_faces, unite_self_overlaps
 from graspd.worker.objects.mesh_geometry import CentredMesh, centre_points, signed_volume
 from graspd.worker.objects.options import UNITS
 from graspd.worker.objects.parts import SurfaceParts, parts_of
@@ -69,7 +69,7 @@ def repair(soup: Soup, options: ObjectOptions) -> RepairedMesh:
     Raises MeshError: wrong units, no volume, holes, several components; the message states the fix."""
     try:
         given = _to_metres(soup, options)
-        mesh = _solid(given, options)
+        mesh = _make_solid(given, options)
     except MeshError as error:
         found, unit = centre_points(soup.vertices[np.unique(soup.faces)]), UNITS[options.units]
         if found.resolution * unit <= max(COARSE_M, 1e-3 * unit * float(np.ptp(found.points, axis=0).max())):
@@ -82,8 +82,8 @@ def repair(soup: Soup, options: ObjectOptions) -> RepairedMesh:
     return replace(mesh, moved_m=moved)
 
 
-def _solid(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
-    mesh = _close(_clean(mesh))
+def _make_solid(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
+    mesh = _close_surface(_clean(mesh))
     if not topology.is_closed(mesh.faces):
         return _accept_open(mesh, options)
     mesh = _resolve_self_intersections(_resolve_components(mesh, options))
@@ -107,7 +107,7 @@ def _to_metres(soup: Soup, options: ObjectOptions) -> RepairedMesh:
     if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
         size = f"{extent:.4g} m long, too large" if extent > MAX_EXTENT_M else f"{1e3 * extent:.3g} mm long, too small"
         fitting = _fitting_units(extent / unit)
-        hints = "; ".join(f"--units {name} makes it {_length(metres)} long" for name, metres in fitting.items())
+        hints = "; ".join(f"--units {name} makes it {_length_text(metres)} long" for name, metres in fitting.items())
         raise MeshError.with_fixes(
             f"the mesh is {size} to grasp",
             f"{hints or 'check its units'} (or give a size: --scale-to 0.1)",
@@ -136,7 +136,7 @@ def _fitting_units(extent: float) -> dict[str, float]:
     return dict(sorted(fitting.items(), key=lambda item: abs(math.log(item[1] / TYPICAL_SIZE_M))))
 
 
-def _length(metres: float) -> str:
+def _length_text(metres: float) -> str:
     return f"{1e3 * metres:.3g} mm" if metres < 0.1 else f"{1e2 * metres:.3g} cm"
 
 
@@ -159,7 +159,7 @@ def _clean(mesh: RepairedMesh) -> RepairedMesh:
     return replace(mesh, vertices=vertices, faces=faces)
 
 
-def _close(mesh: RepairedMesh) -> RepairedMesh:
+def _close_surface(mesh: RepairedMesh) -> RepairedMesh:
     if topology.count_open_edges(mesh.faces):
         mesh = _weld(mesh)
     faces, orientable = topology.unify_winding(mesh.faces)
@@ -168,7 +168,7 @@ def _close(mesh: RepairedMesh) -> RepairedMesh:
     if turned := int((faces != mesh.faces).any(axis=1).sum()):
         mesh = mesh.with_faces(mesh.vertices, faces, f"winding of {turned} faces made consistent with their neighbours")
     if crowded := int((topology.edge_faces(mesh.faces)[1] > 2).sum()):
-        split = topology.part_double_edges(*topology.split_edges(mesh.vertices, mesh.faces))
+        split = topology.separate_double_edges(*topology.split_edges(mesh.vertices, mesh.faces))
         if topology.count_open_edges(split[1]) <= topology.count_open_edges(mesh.faces):
             mesh = mesh.with_faces(*split, f"split {crowded} non-manifold edges")
     if topology.count_open_edges(mesh.faces):
@@ -183,7 +183,7 @@ def _weld(mesh: RepairedMesh) -> RepairedMesh:
     pairs = cKDTree(mesh.vertices).query_pairs(WELD * extent, output_type="ndarray")
     if not len(pairs) or len(pairs) > 10 * len(mesh.vertices):
         return mesh
-    label = topology.parts_of_graph(pairs[:, 0], pairs[:, 1], len(mesh.vertices))
+    label = topology.connected_parts(pairs[:, 0], pairs[:, 1], len(mesh.vertices))
     _, first = np.unique(label, return_index=True)
     faces = label[mesh.faces].astype(np.int64)
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
@@ -196,7 +196,7 @@ def _weld(mesh: RepairedMesh) -> RepairedMesh:
 def _fill_pinholes(mesh: RepairedMesh) -> RepairedMesh:
     """Fill each small hole with a fan; if one hole is large, all holes stay open."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
-    loops = [loop for loop in _rims(mesh.faces) or [] if len(loop) > 2]
+    loops = [loop for loop in _rim_loops(mesh.faces) or [] if len(loop) > 2]
     if not loops or any(np.ptp(mesh.vertices[loop], axis=0).max() > HOLE * extent for loop in loops):
         return mesh
     fans = [[loop[0], loop[i + 1], loop[i]] for loop in loops for i in range(1, len(loop) - 1)]
@@ -204,7 +204,7 @@ def _fill_pinholes(mesh: RepairedMesh) -> RepairedMesh:
     return mesh.with_faces(mesh.vertices, faces, f"filled {len(loops)} small holes")
 
 
-def _rims(faces: Indices) -> list[list[int]] | None:
+def _rim_loops(faces: Indices) -> list[list[int]] | None:
     """Return closed loops of open edges in the direction of their faces; None if they cross."""
     index, counts = topology.edge_faces(faces)
     rim = topology.directed_edges(faces)[counts[index] == 1]
@@ -307,7 +307,7 @@ def _resolve_self_intersections(mesh: RepairedMesh) -> RepairedMesh:
     found = intersecting_faces(mesh.vertices, mesh.faces)
     if found is None or not len(found):
         return replace(mesh, self_intersections=None if found is None else 0)
-    united = untangle(mesh.vertices, mesh.faces)
+    united = unite_self_overlaps(mesh.vertices, mesh.faces)
     if united is None:
         note = f"{len(found)} pairs of faces pass through each other; volume and mass may err there"
         return replace(mesh, self_intersections=len(found), notes=(*mesh.notes, note))

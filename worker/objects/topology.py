@@ -137,7 +137,7 @@ def count_open_edges(faces: Indices) -> int:
     return int((edge_faces(faces)[1] % 2 == 1).sum())
 
 
-def _by_edge(faces: Indices) -> tuple[Indices, Indices, Indices]:
+def _sort_by_edge(faces: Indices) -> tuple[Indices, Indices, Indices]:
     """Return directed edges (3F,) sorted by undirected edge, and the first place and count (E,) of each."""
     index, counts = edge_faces(faces)
     return np.argsort(index, kind="stable"), np.cumsum(counts) - counts, counts
@@ -145,7 +145,7 @@ def _by_edge(faces: Indices) -> tuple[Indices, Indices, Indices]:
 
 def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
     """Return the two faces, (M,) and (M,), at each manifold edge, and a mask (M,) of agreeing windings."""
-    order, starts, counts = _by_edge(faces)
+    order, starts, counts = _sort_by_edge(faces)
     pairs = starts[counts == 2]
     one, two = order[pairs], order[pairs + 1]
     edges = directed_edges(faces)
@@ -153,7 +153,7 @@ def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
     return one % len(faces), two % len(faces), agree
 
 
-def parts_of_graph(one: Indices, other: Indices, count: int) -> NDArray[np.int32]:
+def connected_parts(one: Indices, other: Indices, count: int) -> NDArray[np.int32]:
     """Number the connected parts (N,) of `count` nodes; edges join nodes `one` (E,) with `other` (E,)."""
     from scipy.sparse import coo_matrix  # slow to load, and a prepared object needs none
     from scipy.sparse.csgraph import connected_components
@@ -164,7 +164,7 @@ def parts_of_graph(one: Indices, other: Indices, count: int) -> NDArray[np.int32
 
 def components(faces: Indices) -> Indices:
     """Return the index (F,) of each face's connected component (by shared vertices)."""
-    label = parts_of_graph(faces[:, :2].T.ravel(), faces[:, 1:].T.ravel(), int(faces.max()) + 1)
+    label = connected_parts(faces[:, :2].T.ravel(), faces[:, 1:].T.ravel(), int(faces.max()) + 1)
     _, numbers = np.unique(label[faces[:, 0]], return_inverse=True)
     return numbers.reshape(-1).astype(np.int64)
 
@@ -178,7 +178,7 @@ def unify_winding(faces: Indices) -> tuple[Indices, bool]:
     cross = np.where(agree, 0, count)
     rows = np.concatenate([one, one + count])
     columns = np.concatenate([two + cross, two + count - cross])
-    label = parts_of_graph(rows, columns, 2 * count)
+    label = connected_parts(rows, columns, 2 * count)
     orientable = bool((label[:count] != label[count:]).all())
     # A patch has two choices; the one that flips fewer faces is taken, since most of a file is usually right.
     low = np.minimum(label[:count], label[count:])
@@ -191,13 +191,13 @@ def unify_winding(faces: Indices) -> tuple[Indices, bool]:
 def split_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
     """Split edges with more than two faces: vertices there are duplicated, one for each fan of faces.
     Faces at a crowded edge are paired as neighbours around the edge that enclose material between them."""
-    order, starts, counts = _by_edge(faces)
+    order, starts, counts = _sort_by_edge(faces)
     count, edges = len(faces), directed_edges(faces)
     simple = starts[counts == 2]
     one, two = [order[simple]], [order[simple + 1]]
     for edge in np.flatnonzero(counts > 2):
         half = order[starts[edge] : starts[edge] + counts[edge]]
-        pairs = np.array(_pairs_around(vertices, faces, edges, half), dtype=np.int64).reshape(-1, 2)
+        pairs = np.array(_pair_half_edges(vertices, faces, edges, half), dtype=np.int64).reshape(-1, 2)
         one.append(pairs[:, 0])
         two.append(pairs[:, 1])
     a, b = np.concatenate(one), np.concatenate(two)
@@ -205,21 +205,21 @@ def split_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
     start, end = _corner(a, count), _corner(b, count)
     after, before = _corner(a, count, 1), _corner(b, count, 1)
     rows, columns = np.concatenate([start, after]), np.concatenate([before, end])
-    label = parts_of_graph(rows, columns, 3 * count)
+    label = connected_parts(rows, columns, 3 * count)
     _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
     return vertices[faces.reshape(-1)[first]], inverse.reshape(-1, 3).astype(np.int64)
 
 
-def part_double_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
+def separate_double_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
     """Separate edges between the same two vertices: all but one edge get a vertex in the middle.
     Such edges are valid on a surface with a tunnel, but in a list of faces they look like one edge with four faces."""
-    order, starts, counts = _by_edge(faces)
+    order, starts, counts = _sort_by_edge(faces)
     count, edges = len(faces), directed_edges(faces)
     points, extra, touched = [vertices], [], set[int]()
     changed = faces.copy()
     for edge in np.flatnonzero(counts > 2):
         half = order[starts[edge] : starts[edge] + counts[edge]]
-        for pair in _pairs_around(vertices, faces, edges, half)[1:]:
+        for pair in _pair_half_edges(vertices, faces, edges, half)[1:]:
             if touched & {int(h % count) for h in pair}:
                 continue
             middle = len(vertices) + len(points) - 1
@@ -238,7 +238,7 @@ def _corner(half: Indices, count: int, step: int = 0) -> Indices:
     return 3 * (half % count) + (half // count + step) % 3
 
 
-def _pairs_around(vertices: Floats, faces: Indices, edges: Indices, half: Indices) -> list[tuple[int, int]]:
+def _pair_half_edges(vertices: Floats, faces: Indices, edges: Indices, half: Indices) -> list[tuple[int, int]]:
     """Pair half-edges at one edge: sorted by angle, each face is joined to the next face on its back side."""
     a, b = np.sort(edges[half[0]])
     axis = vertices[b] - vertices[a]

@@ -200,7 +200,7 @@ class Requirements:
             out &= _cosine(hand, grasp, axes) >= np.cos(self.cone)
         if self.rule is not None:
             probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
-            out &= self.rule.applies(pattern_of(hand, probe, probe.touch(grasp, reach=_REACH_M)))
+            out &= self.rule.applies(pattern_of(hand, probe, probe.nearest_points(grasp, reach=_REACH_M)))
         return out
 
     def failed(

@@ -17,7 +17,7 @@ from importlib import import_module
 from multiprocessing.connection import Connection
 from typing import Any
 
-from graspd.service.model.libraries import mark_process, pause_garbage_collection
+from graspd.service.model.libraries import freeze_imports, pause_garbage_collection
 
 
 @dataclass(frozen=True)
@@ -44,20 +44,20 @@ def serve(connection: Connection, modules: Sequence[str]) -> None:
 
     # Imports and work may take seconds: a separate thread detects that the peer is gone.
     threading.Thread(target=read, daemon=True).start()
-    mark_process()
+    freeze_imports()
     with pause_garbage_collection():
         for name in modules:
             import_module(name)
     kept: dict[str, Any] = {}
     while True:
-        answer = _answer(orders.get(), kept)
+        answer = _process_order(orders.get(), kept)
         try:
             connection.send_bytes(answer)
         except OSError:
             os._exit(0)
 
 
-def _answer(order: bytes, kept: dict[str, Any]) -> bytes:
+def _process_order(order: bytes, kept: dict[str, Any]) -> bytes:
     try:
         wanted: WorkItem = pickle.loads(order)
         for key in wanted.forget:
@@ -66,10 +66,10 @@ def _answer(order: bytes, kept: dict[str, Any]) -> bytes:
             kept[wanted.key] = pickle.loads(wanted.shared)
         return pickle.dumps((True, wanted.work(kept[wanted.key], wanted.part)))
     except Exception as error:
-        return pickle.dumps((False, _portable(error)))
+        return pickle.dumps((False, _to_picklable(error)))
 
 
-def _portable(error: Exception) -> Exception:
+def _to_picklable(error: Exception) -> Exception:
     """Return the error in a form that the peer can unpickle, with its traceback."""
     error.add_note("in a pool process: " + "".join(traceback.format_tb(error.__traceback__)))
     try:

@@ -61,8 +61,8 @@ class Pool(AbstractContextManager["Pool"]):
     def __init__(self, processes: int, modules: Sequence[str] = ()) -> None:
         """`modules` are imported by each process before its first item."""
         self.processes = processes
-        self._places = [_Place(modules) for _ in range(processes)]
-        self._idle: queue.SimpleQueue[_Place] = queue.SimpleQueue()
+        self._places = [_Slot(modules) for _ in range(processes)]
+        self._idle: queue.SimpleQueue[_Slot] = queue.SimpleQueue()
         self._threads = ThreadPoolExecutor(processes, thread_name_prefix="pool")
         self._changing = threading.Lock()
         self._started = self._closed = False
@@ -100,7 +100,7 @@ class Pool(AbstractContextManager["Pool"]):
         request = _Request(work, key, shared, done)
         with self._changing:
             wanted = () if self._closed else enumerate(parts)
-            futures = [self._threads.submit(self._do, request, number, part) for number, part in wanted]
+            futures = [self._threads.submit(self._run_part, request, number, part) for number, part in wanted]
         try:
             while True:
                 _, left = wait(futures, _LOOK_S, FIRST_EXCEPTION)
@@ -124,10 +124,10 @@ class Pool(AbstractContextManager["Pool"]):
         for place in self._places:
             place.end()
 
-    def _do(self, request: _Request, number: int, part: Any) -> Any:
+    def _run_part(self, request: _Request, number: int, part: Any) -> Any:
         place = self._idle.get()
         try:
-            made = place.do(request, part)
+            made = place.run_item(request, part)
         finally:
             self._idle.put(place)
             if self._closed:
@@ -137,7 +137,7 @@ class Pool(AbstractContextManager["Pool"]):
         return made
 
 
-class _Place:
+class _Slot:
     """A place of the pool: one process at a time, and the keys in its cache. Any thread may call `end`."""
 
     def __init__(self, modules: Sequence[str]) -> None:
@@ -155,14 +155,14 @@ class _Place:
             env={**os.environ, **_NO_GPU},
         )
 
-    def do(self, request: _Request, part: Any) -> Any:
+    def run_item(self, request: _Request, part: Any) -> Any:
         """Return the result of an item; raise ProcessLost, or the error of the item."""
         try:
             if self._is_gone():
                 self._stop()
                 self.start()
             assert self._connection is not None
-            self._connection.send_bytes(pickle.dumps(self._order(request, part)))
+            self._connection.send_bytes(pickle.dumps(self._work_item(request, part)))
             while not self._connection.poll(_LOOK_S):
                 if (since := request.dropped_at) is not None and time.monotonic() - since > _PATIENCE_S:
                     log.warning("a process does not end an abandoned item; it is killed")
@@ -182,7 +182,7 @@ class _Place:
             return True
         return self._connection.poll()
 
-    def _order(self, request: _Request, part: Any) -> WorkItem:
+    def _work_item(self, request: _Request, part: Any) -> WorkItem:
         forget = list[str]()
         known = request.key in self._kept
         self._kept[request.key] = None

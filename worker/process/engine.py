@@ -25,11 +25,11 @@ from typing import TYPE_CHECKING, Any
 from graspd.service import telemetry
 from graspd.service.model.cores import available_memory
 from graspd.service.model.errors import BusyError, InputError, TaskRefused, UnavailableError
-from graspd.service.model.libraries import mark_process
+from graspd.service.model.libraries import freeze_imports
 from graspd.service.model.states import Stage
 from graspd.service.pipeline.identity import check_service
 from graspd.service.store.store import Store, open_store
-from graspd.worker.engines.batch_sizes import batches_at_once, processes_at_once
+from graspd.worker.engines.batch_sizes import batches_per_launch, pool_process_count
 from graspd.worker.engines.devices import Device
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.pool.pool import MODULES, Pool
@@ -72,20 +72,20 @@ class Engine:
                 self._start()
                 word, about = self._orders.get()
                 while word != "end":
-                    self._carry_out(word, about)
+                    self._execute_order(word, about)
                     word, about = self._orders.get()
                 self._surroundings.close()
             except (InputError, UnavailableError, BusyError) as error:
                 self._send("refused", error)
 
-    def _carry_out(self, word: str, about: Any) -> None:
+    def _execute_order(self, word: str, about: Any) -> None:
         if word == "service":
             check_service(self._surroundings.store, about)
             self._send("service", True)
         elif word == "check":
-            self._send("ready", self._admitted())
+            self._send("ready", self._check_engine())
         else:
-            self._do(about)
+            self._run_task(about)
 
     def update(self, **facts: str | float) -> None:
         self._send("facts", facts)
@@ -105,7 +105,7 @@ class Engine:
         self.update(device_name=device.name)
         device.start_resolving(lambda: self.update(device=device.resolve(), device_name=device.name))
 
-    def _admitted(self) -> bool:
+    def _check_engine(self) -> bool:
         """Check the engine before the first task; with `Setup.patient`, wait in quarantine until it passes."""
         # Synthesis is the most expensive stage. If it is among the stages, the others are only checked after failures
         # and load with their first task.
@@ -119,7 +119,7 @@ class Engine:
     def _wait_in_quarantine(self, stages: Collection[Stage]) -> bool:
         return self._fitness.wait_in_quarantine(stages, self.update, lambda: self._reason is not None)
 
-    def _do(self, raw: dict[str, Any]) -> None:
+    def _run_task(self, raw: dict[str, Any]) -> None:
         context = self._surroundings.context(raw, self.update)
         with self._changing:
             self._context = context
@@ -187,7 +187,7 @@ class TaskResources:
     def _join(self) -> int:
         """Return the number of batches per kernel launch; block until the device is known."""
         join = self.settings.join
-        return batches_at_once(self._device.resolve(), None if join == "auto" else int(join))
+        return batches_per_launch(self._device.resolve(), None if join == "auto" else int(join))
 
     def pool(self, stage: str) -> Pool | None:
         """Return the pool that validates and measures, or None; block until its size is known."""
@@ -200,7 +200,7 @@ class TaskResources:
     @cached_property
     def _pool(self) -> Pool | None:
         chosen, device = self.settings, self._device.resolve()
-        count = processes_at_once(device, chosen.processes, threads=chosen.threads, workers=chosen.workers_here)
+        count = pool_process_count(device, chosen.processes, threads=chosen.threads, workers=chosen.workers_here)
         return Pool(count, MODULES) if count > 1 else None
 
     def close(self) -> None:
@@ -235,15 +235,15 @@ def main(table: Mapping[Stage, StageFunction] | None = None, check: Check | None
     """Run the process. It ignores signals to end: the worker handles them, and ends this process."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    mark_process()
+    freeze_imports()
     connection = Connection(int(sys.argv[-1]))
     setup: Setup = connection.recv()
     telemetry.set_up_logs(setup.settings, "worker")
     Engine(connection, setup, table, check).serve()
-    end()
+    exit_process()
 
 
-def end() -> None:
+def exit_process() -> None:
     """Exit at once: finalising Warp and its kernels takes seconds, and no state needs saving."""
     atexit._run_exitfuncs()
     sys.stderr.flush()

@@ -70,7 +70,7 @@ class Fitness:
         if isinstance(error, _OF_THE_TASK):
             return ""
         if self.try_engine((message.stage,)):
-            others = self._done_elsewhere(except_for=message.task_id)
+            others = self._tasks_done_elsewhere(except_for=message.task_id)
             if len(others) >= _DONE_ELSEWHERE:
                 self._can_pass = False
                 self.reason = f"{len(others)} tasks in a row failed here and were done by other workers"
@@ -97,7 +97,7 @@ class Fitness:
                 return True
         return False
 
-    def _done_elsewhere(self, *, except_for: str) -> list[str]:
+    def _tasks_done_elsewhere(self, *, except_for: str) -> list[str]:
         try:
             others = [(task, made) for task, made in self._failed.items() if task != except_for]
             return [task for task, made in others if shard_exists(self._store, *made)]

@@ -12,7 +12,7 @@ from typing import Any, Final
 from redis.exceptions import RedisError
 
 from graspd.service.model.clock import timestamp
-from graspd.service.model.messages import WorkerBeat
+from graspd.service.model.messages import WorkerHeartbeat
 from graspd.service.queue.connection import connect
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import register_worker, unregister_worker
@@ -30,7 +30,7 @@ class Heartbeat:
     def __init__(
         self,
         url: str,
-        beat: WorkerBeat,
+        beat: WorkerHeartbeat,
         *,
         lease_s: float,
         alive: Path | None = None,

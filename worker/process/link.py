@@ -53,7 +53,7 @@ class Link:
         try:
             return self._connection.recv() if self._connection.poll(wait_s) else None
         except (EOFError, OSError):
-            raise EngineLost(f"the engine ended ({self._end()})") from None
+            raise EngineLost(f"the engine ended ({self._end_process()})") from None
 
     @property
     def is_stopped(self) -> bool:
@@ -67,10 +67,10 @@ class Link:
     def close(self) -> None:
         """End the engine, gracefully if it responds in time."""
         self.send("end", StopReason.SHUTDOWN)
-        self._end()
+        self._end_process()
         self._connection.close()
 
-    def _end(self) -> str:
+    def _end_process(self) -> str:
         return "its thread ended" if self._process is None else end_child(self._process, _END_S)
 
 

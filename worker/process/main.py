@@ -26,7 +26,7 @@ from rq.serializers import JSONSerializer
 from rq.worker import WorkerStatus
 
 from graspd.service.model.errors import GraspdError, QueueUnavailable, TaskRefused
-from graspd.service.model.messages import WorkerBeat, capabilities
+from graspd.service.model.messages import WorkerHeartbeat, capabilities
 from graspd.service.model.states import Stage
 from graspd.service.queue import entries
 from graspd.service.queue.connection import redis_url
@@ -76,13 +76,13 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
 
     def check_service(self) -> None:
         """Raise BusyError if Redis belongs to another service, InputError if the device is unknown."""
-        self._engine.send("service", self._queue.service())
-        self._await("service")
+        self._engine.send("service", self._queue.service_id())
+        self._wait_for_answer("service")
 
     def admit(self) -> bool:
         """Wait for the engine's check before the first task; False if the worker must end. Raises EngineLost."""
         self._engine.send("check")
-        return bool(self._await("ready"))
+        return bool(self._wait_for_answer("ready"))
 
     def execute_job(self, job: Any, queue: Any) -> None:
         """Run one task under a lease. Its outcome is sent after the lease is released."""
@@ -92,7 +92,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         outcome: Event | None = None
         self._engine.send("task", job.args[0])
         try:
-            outcome = self._await("done", partial(self._keep_lease, job))
+            outcome = self._wait_for_answer("done", partial(self._keep_lease, job))
         except GraspdError as error:
             log.warning("the engine refuses a task: %s", error)
         except EngineLost as error:
@@ -104,13 +104,13 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self.tasks_done += 1
         if outcome is not None:
             self._publish(outcome)
-        self.engine_is = self._await("idle")
+        self.engine_is = self._wait_for_answer("idle")
         if self.engine_is != "fit":
             self._heartbeat.update(state="stopping")
             raise StopRequested
         self.set_state(WorkerStatus.IDLE)
 
-    def _await(self, word: str, beat: Callable[[], None] = lambda: None) -> Any:
+    def _wait_for_answer(self, word: str, beat: Callable[[], None] = lambda: None) -> Any:
         """Return the engine's answer within the time limit of a task; pass on its other messages meanwhile."""
         began = time.monotonic()
         due = began + self._heartbeat.interval_s
@@ -192,7 +192,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             try:
                 found = super().dequeue_job_and_maintain_ttl(*args, **options)
                 self.found_none = found is None
-                return found and (entries.checked_job(*found), found[1])
+                return found and (entries.sanitized_job(*found), found[1])
             except TaskRefused as error:
                 log.warning("%s", error)
                 self.connection.delete(found[0].key)
@@ -233,7 +233,7 @@ def run_worker(
     queue = open_queue(settings, patience=_PATIENCE)
     heart = Heartbeat(
         redis_url(settings),
-        WorkerBeat.of_this_process(name, settings.device, stages),
+        WorkerHeartbeat.of_this_process(name, settings.device, stages),
         lease_s=settings.lease_s,
         alive=settings.heartbeat_file,
         is_stopped=lambda: engine.is_stopped,

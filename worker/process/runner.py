@@ -41,7 +41,7 @@ from graspd.service.telemetry import bind_subjects
 from graspd.worker.engines.devices import DeviceLost, check_device
 from graspd.worker.pool.pool import ProcessLost
 from graspd.worker.process.fitness import Fitness, is_first_loss
-from graspd.worker.stages.context import StageFunction, StopReason, TaskContext, shard_of
+from graspd.worker.stages.context import StageFunction, StopReason, TaskContext, build_shard
 
 log = logging.getLogger(__name__)
 _TRACE_CHARACTERS: Final = 8000
@@ -75,36 +75,36 @@ class Runner:
     def _run(self, message: Message, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
         started, clock = timestamp(), time.monotonic()
         try:
-            if lacking := capabilities().lacks(requirements_of(message)):
+            if lacking := capabilities().unmet_requirement(requirements_of(message)):
                 # The task is for another worker. The controller reports tasks that no present worker can do.
-                return self._event(EventKind.DEFERRED, message, message=f"this worker cannot run it: {lacking}")
-            return self._do(message, context)
+                return self._create_event(EventKind.DEFERRED, message, message=f"this worker cannot run it: {lacking}")
+            return self._run_stage(message, context)
         except TaskCancelled:
-            return self._stopped(message, context, started)
+            return self._stopped_event(message, context, started)
         except UnavailableError as error:
-            return self._event(EventKind.DEFERRED, message, message=str(error))
+            return self._create_event(EventKind.DEFERRED, message, message=str(error))
         except Exception as error:
             if is_disk_full(error):
                 why = f"{os.strerror(errno.ENOSPC)}: {_one_line(error)}"
-                return self._event(EventKind.DEFERRED, message, message=why)
-            if (why := self._loss(error, context)) and is_first_loss(message.task_id):
+                return self._create_event(EventKind.DEFERRED, message, message=why)
+            if (why := self._describe_loss(error, context)) and is_first_loss(message.task_id):
                 log.error("the task is returned to the queue: %s", why, exc_info=True)
-                return self._event(EventKind.RETURNED, message, message=why)
+                return self._create_event(EventKind.RETURNED, message, message=why)
             if not why and self._fitness is not None and (why := self._fitness.diagnose(message, error)):
                 log.warning("the task is returned to the queue; it failed because of this worker", exc_info=True)
-                return self._event(EventKind.RETURNED, message, message=why)
-            return self._failed(message, error, context, started)
+                return self._create_event(EventKind.RETURNED, message, message=why)
+            return self._failure_event(message, error, context, started)
         finally:
             log.info("%s took %.2f s", message.stage, time.monotonic() - clock)
 
-    def _do(self, message: Message, context: TaskContext) -> Event:
+    def _run_stage(self, message: Message, context: TaskContext) -> Event:
         context.check()
-        output = output_of(message)
+        output = output_id(message)
         if self._is_done(message, context):
-            return self._event(EventKind.FINISHED, message, output=output, message="was there already")
+            return self._create_event(EventKind.FINISHED, message, output=output, message="was there already")
         if message.stage not in self._stages:
             raise TaskRefused(f"this worker does no {message.stage} tasks")
-        self._publish(self._event(EventKind.STARTED, message))
+        self._publish(self._create_event(EventKind.STARTED, message))
         clock = time.perf_counter()
         lost = self._lost_manifest(message, context)
         made = self._stages[message.stage](message, context)
@@ -113,7 +113,7 @@ class Runner:
         if made is not None and isinstance(message, TaskMessage):
             context.check()
             device, worker = context.device, self._worker
-            manifest, data = shard_of(message, made, device=device, seconds=seconds, worker=worker, lost=lost)
+            manifest, data = build_shard(message, made, device=device, seconds=seconds, worker=worker, lost=lost)
             if lost is not None and manifest.sha256 != lost.sha256:
                 raise DamagedShard(
                     f"{lost.key} was made again with another content: first on {lost.device} by graspd "
@@ -122,9 +122,9 @@ class Runner:
             publish_shard(context.store, manifest, data)
         if self._fitness is not None:
             self._fitness.record_success()
-        return self._event(EventKind.FINISHED, message, output=output, seconds=seconds)
+        return self._create_event(EventKind.FINISHED, message, output=output, seconds=seconds)
 
-    def _loss(self, error: Exception, context: TaskContext) -> str:
+    def _describe_loss(self, error: Exception, context: TaskContext) -> str:
         """Return how the device or a pool process was lost if that caused the error; else ""."""
         try:
             self._check_device(context.device)
@@ -146,19 +146,19 @@ class Runner:
             return None
         return load_manifest(context.store, message.stage, message.output)
 
-    def _stopped(self, message: Message, context: TaskContext, started: str) -> Event | None:
+    def _stopped_event(self, message: Message, context: TaskContext, started: str) -> Event | None:
         reason = context.stop_reason
         if reason is StopReason.TIMEOUT:
             error = TimeoutError("the task exceeded the time limit GRASPD_TASK_TIMEOUT_S")
-            return self._failed(message, error, context, started)
+            return self._failure_event(message, error, context, started)
         kind = _STOPPED.get(reason) if reason is not None else EventKind.CANCELLED
-        return None if kind is None else self._event(kind, message, output=output_of(message))
+        return None if kind is None else self._create_event(kind, message, output=output_id(message))
 
-    def _failed(self, message: Message, error: Exception, context: TaskContext, started: str) -> Event:
+    def _failure_event(self, message: Message, error: Exception, context: TaskContext, started: str) -> Event:
         log.warning("task failed: %s", error, exc_info=not isinstance(error, InputError))
         # Retries fix neither invalid input nor a damaged store.
         last = isinstance(error, InputError | DamagedError | TaskRefused) or message.attempt >= message.max_attempt
-        attempt = AttemptRecord.of(
+        attempt = AttemptRecord.from_message(
             message,
             kind=type(error).__name__,
             reason=_one_line(error),
@@ -170,14 +170,14 @@ class Runner:
         try:
             if isinstance(message, TaskMessage) and _has_manifest(message, context):
                 # The task has already succeeded: another worker was faster, or a lost file could not be made again.
-                return self._event(EventKind.CANCELLED, message, message=attempt.reason)
+                return self._create_event(EventKind.CANCELLED, message, message=attempt.reason)
             put_record(context.store, names.attempt_key(attempt.task_id, attempt.number), attempt)
         except UnavailableError as error:
-            return self._event(EventKind.DEFERRED, message, message=f"{attempt.reason}; {error}")
-        return self._event(EventKind.FAILED, message, message=attempt.reason, last=attempt.last)
+            return self._create_event(EventKind.DEFERRED, message, message=f"{attempt.reason}; {error}")
+        return self._create_event(EventKind.FAILED, message, message=attempt.reason, last=attempt.last)
 
-    def _event(self, kind: EventKind, task: Message, **more: Any) -> Event:
-        facts: dict[str, Any] = {"output": output_of(task), "stage": task.stage, "attempt": task.attempt}
+    def _create_event(self, kind: EventKind, task: Message, **more: Any) -> Event:
+        facts: dict[str, Any] = {"output": output_id(task), "stage": task.stage, "attempt": task.attempt}
         if isinstance(task, TaskMessage):
             facts |= {"job_id": task.job_id, "batch": task.batch}
         return Event(kind=kind, at=timestamp(), task_id=task.task_id, worker=self._worker, **facts | more)
@@ -209,7 +209,7 @@ def _subjects(message: Message) -> dict[str, Any]:
     return found
 
 
-def output_of(message: Message) -> str:
+def output_id(message: Message) -> str:
     """Return the output of a task: a shard id, or kind and digest of the checked asset."""
     return message.output if isinstance(message, TaskMessage) else f"{message.kind.value}/{message.digest}"
 

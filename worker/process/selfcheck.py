@@ -55,25 +55,25 @@ def _check_synthesis(run: ExecutionContext) -> None:
     from graspd.worker.hands.load import hand_from_path
 
     request = JobRequest(hand=_HAND, object="ball", grasps=1, fidelity="draft", want="candidates")
-    found = validated_grasps(hand_from_path(_HAND), _ball(), request, count=1, run=run)
+    found = validated_grasps(hand_from_path(_HAND), _faceted_ball(), request, count=1, run=run)
     finite = np.isfinite(found.grasps.grasp.hand_pose).all()
-    _expect(len(found.grasps) == 1 and finite, "a grasp of a ball is not finite")
+    _require(len(found.grasps) == 1 and finite, "a grasp of a ball is not finite")
 
 
 def _check_scene(run: ExecutionContext) -> None:
     from graspd.worker.scenes import drop
 
-    height = drop(_ball(), count=1, seed=0)["scene/object_pose"][0, 2]
+    height = drop(_faceted_ball(), count=1, seed=0)["scene/object_pose"][0, 2]
     # The origin of the ball's frame is its centre. Because of its facets, the height differs from the radius.
-    _expect(abs(height - _RADIUS_M) < 0.1 * _RADIUS_M, f"a ball comes to rest at a height of {height:.3g} m")
+    _require(abs(height - _RADIUS_M) < 0.1 * _RADIUS_M, f"a ball comes to rest at a height of {height:.3g} m")
 
 
 def _check_pictures(run: ExecutionContext) -> None:
     from graspd.worker.rendering import render
 
     pose = np.array([[0.0, 0.0, _RADIUS_M, 1.0, 0.0, 0.0, 0.0]])
-    made = render(_ball(), pose, views=1, stereo=False, width=32, height=24, seed=0, run=run)
-    _expect(int(np.ptp(made["image/rgb"])) > 0, "a picture of a ball shows nothing")
+    made = render(_faceted_ball(), pose, views=1, stereo=False, width=32, height=24, seed=0, run=run)
+    _require(int(np.ptp(made["image/rgb"])) > 0, "a picture of a ball shows nothing")
 
 
 _CHECKS: Final[Mapping[Stage, Callable[[ExecutionContext], None]]] = {
@@ -83,7 +83,7 @@ _CHECKS: Final[Mapping[Stage, Callable[[ExecutionContext], None]]] = {
 }
 
 
-def _ball() -> ObjectModel:
+def _faceted_ball() -> ObjectModel:
     """Return a ball with flat faces, so that it comes to rest."""
     from manifold3d import Manifold
 
@@ -95,6 +95,6 @@ def _ball() -> ObjectModel:
     return load_object({"ball.stl": mesh}, name="ball", digest="", face_error_m=0.0)
 
 
-def _expect(sensible: object, otherwise: str) -> None:
+def _require(sensible: object, otherwise: str) -> None:
     if not sensible:
         raise ArithmeticError(otherwise)

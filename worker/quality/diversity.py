@@ -40,7 +40,7 @@ def hand_points(hand: HandModel, posture: Posture) -> Floats:
     return np.asarray(apply(poses[:, points.body], points.position))
 
 
-def distances(points: Floats, one: NDArray[np.intp], other: NDArray[np.intp]) -> Floats:
+def grasp_distances(points: Floats, one: NDArray[np.intp], other: NDArray[np.intp]) -> Floats:
     """Compute distances (K,) [m] between grasps `one` and `other`, (K,) indices into `points` (N, P, 3)."""
     parts = [slice(i, i + _PAIRS) for i in range(0, len(one), _PAIRS)]
     found = [np.linalg.norm(points[one[part]] - points[other[part]], axis=2).mean(axis=1) for part in parts]
@@ -57,10 +57,10 @@ def least_distance(points: Floats) -> float | None:
     near = np.asarray(middles.query(middles.data, k=2)[1])
     rows = np.arange(len(points))
     # If mean points coincide, the first neighbour may be a point other than the point itself.
-    bound = float(distances(points, rows, np.where(near[:, 0] == rows, near[:, 1], near[:, 0])).min())
+    bound = float(grasp_distances(points, rows, np.where(near[:, 0] == rows, near[:, 1], near[:, 0])).min())
     # The mean distance of points is at least the distance of their means.
     pairs = middles.query_pairs(bound, output_type="ndarray")
-    return min(bound, *distances(points, pairs[:, 0], pairs[:, 1]).tolist()) if len(pairs) else bound
+    return min(bound, *grasp_distances(points, pairs[:, 0], pairs[:, 1]).tolist()) if len(pairs) else bound
 
 
 def distinct_mask(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool_]:
@@ -73,7 +73,7 @@ def distinct_mask(points: Floats, least: float, *, given: int = 0) -> NDArray[np
 
     # The mean distance of points is at least the distance of their means.
     pairs = np.asarray(cKDTree(points.mean(axis=1)).query_pairs(least, output_type="ndarray"), np.intp)
-    near = pairs[distances(points, pairs[:, 0], pairs[:, 1]) < least]
+    near = pairs[grasp_distances(points, pairs[:, 0], pairs[:, 1]) < least]
     near = near[near[:, 1] >= given]
     for first, second in near[np.lexsort((near[:, 0], near[:, 1]))].tolist():
         if kept[first]:
@@ -87,7 +87,7 @@ def select_farthest(points: Floats, count: int) -> NDArray[np.intp]:
     rows, least = list[int](), np.full(len(points), np.inf)
     for _ in range(min(count, len(points))):
         rows.append(int(least.argmax()))
-        least = np.minimum(least, distances(points, np.full(len(points), rows[-1]), np.arange(len(points))))
+        least = np.minimum(least, grasp_distances(points, np.full(len(points), rows[-1]), np.arange(len(points))))
         least[rows] = -1.0
     return np.array(rows, np.intp)
 
@@ -100,10 +100,10 @@ def _rotation_vector(quaternion: Floats) -> Floats:
 
 
 def approach_cells(hand: HandModel, quaternions: NDArray[np.float64]) -> NDArray[np.int32]:
-    return cells_of(-quat_rotate(quaternions, hand.palm.approach)).astype(np.int32)
+    return direction_cells(-quat_rotate(quaternions, hand.palm.approach)).astype(np.int32)
 
 
-def cells_of(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
+def direction_cells(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
     """Return the cells (N,) of unit vectors (N, 3): band times `sectors` plus sector.
     Band 0 is the lowest; sector 0 begins at azimuth -180 degrees."""
     z = np.clip(directions[:, 2], -1.0, 1.0)

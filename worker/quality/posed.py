@@ -39,24 +39,24 @@ class PostureData:
         with wp.ScopedDevice(self.device):
             for module in (touching, balance, opening, jamming, optimizers):
                 wp.load_module(module=module, device=self.device)
-            self.chain, self.points = chain_of(probe.hand, self.device), _points(probe)
+            self.chain, self.points = chain_of(probe.hand, self.device), _upload_points(probe)
             self.effort = wp.array(probe.hand.effort, dtype=wp.float64)
             self.finger = wp.array(finger, dtype=wp.int32)  # (L,) finger of each body; -1 without finger
 
-    def parts(self, count: int) -> list[slice]:
+    def row_slices(self, count: int) -> list[slice]:
         return [slice(i, min(i + self.at_once, count)) for i in range(0, count, self.at_once)]
 
-    def bodies(self, count: int) -> Any:
+    def allocate_bodies(self, count: int) -> Any:
         with wp.ScopedDevice(self.device):
             return allocate_bodies(self.hand, count)
 
-    def roots(self, hand_pose: Floats) -> tuple[Any, Any]:
+    def upload_roots(self, hand_pose: Floats) -> tuple[Any, Any]:
         """Return positions (about the object's centre of mass) and rotations of root poses (n, 7)."""
         with wp.ScopedDevice(self.device):
             position = wp.array(hand_pose[:, :3] - self.probe.obj.centre_of_mass, dtype=wp.vec3d)
             return position, wp.array(to_xyzw(hand_pose[:, 3:]), dtype=wp.quatd)
 
-    def touch(self, posture: Posture, reach: float) -> tuple[Any, Any]:
+    def nearest_points(self, posture: Posture, reach: float) -> tuple[Any, Any]:
         """Return the bodies of posed hands, and the object's surface within `reach` [m] of their points."""
         count = len(posture)
         root = np.array(posture.hand_pose, float)
@@ -67,10 +67,10 @@ class PostureData:
             near.distance, near.cosine = wp.empty(shape, dtype=wp.float32), wp.empty(shape, dtype=wp.float64)
             near.closest, near.normal = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
             inputs = [self.probe.skin, self.points, self.lane, bodies, reach]
-            launch(touching.touch, (count, self.lanes), inputs=inputs, outputs=[near])
+            launch(touching.find_nearby_surface, (count, self.lanes), inputs=inputs, outputs=[near])
         return bodies, near
 
-    def touching_links(self, posture: Posture) -> NDArray[np.int32]:
+    def count_touching_links(self, posture: Posture) -> NDArray[np.int32]:
         """Count (N,) bodies of posed hands with points closer to the object than `LINK_CONTACT_M`.
         The quality table also tests object points, so its number is at least as large."""
         return contact_links(self._gaps(posture, LINK_CONTACT_M, self.points.body.numpy(), self.hand.bodies))
@@ -83,14 +83,14 @@ class PostureData:
         """Return the least distance (N, count) of each part of the hand, at most `reach` [m].
         `part` (points,) is the part of each hand point; points with -1 are ignored."""
         found = np.full((len(posture), count), reach)
-        for rows in self.parts(len(posture)):
-            distance = self.touch(posture.take(rows), reach)[1].distance.numpy()
+        for rows in self.row_slices(len(posture)):
+            distance = self.nearest_points(posture.take(rows), reach)[1].distance.numpy()
             for one in np.unique(part[part >= 0]):
                 found[rows, one] = distance[:, part == one].min(axis=1)
         return found
 
 
-def _points(probe: Probe) -> Any:
+def _upload_points(probe: Probe) -> Any:
     points, out = probe.points, touching.Points()
     order = np.argsort(points.body, kind="stable")
     out.first = wp.array(np.searchsorted(points.body[order], np.arange(probe.hand.bodies + 1)), dtype=wp.int32)

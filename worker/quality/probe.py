@@ -14,7 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats, compose, quat_to_matrix
-from graspd.worker.engines.backend import binary_name
+from graspd.worker.engines.backend import binary_identity
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, SurfacePoints
@@ -79,7 +79,7 @@ class Probe:
             # Load here, so that threads do not compile the same module at once.
             wp.load_module(module=kernels, device=device)
             self._body = wp.array(self.points.body, dtype=wp.int32)
-            self.body_points = _by_body(self.points, hand.bodies)
+            self.body_points = _upload_points(self.points, hand.bodies)
             self._origin = wp.vec3d(*obj.centre_of_mass)
             self.frames = [
                 wp.array(self._piece_frame[:, :3], dtype=wp.vec3d),
@@ -91,9 +91,9 @@ class Probe:
                 indices=wp.array(obj.faces.ravel(), dtype=wp.int32),
                 support_winding_number=not obj.watertight,
             )
-        self.skin = self._skin()
+        self.skin = self._device_surface()
 
-    def _skin(self) -> Any:
+    def _device_surface(self) -> Any:
         obj, margin = self.obj, 1e-4
         low = obj.vertices.min(axis=0) - obj.centre_of_mass - REACH_M - margin
         high = obj.vertices.max(axis=0) - obj.centre_of_mass + REACH_M + margin
@@ -114,7 +114,7 @@ class Probe:
 
             if wp.get_device().is_cpu:
                 # Cached on disk: every process needs the grid at its start, and it depends on the object alone.
-                terms = (obj.content, binary_name(kernels))
+                terms = (obj.content, binary_identity(kernels))
                 fits = partial(_is_grid, counts=counts)
                 kept = cached_arrays("coarse_grids", terms, (sys.modules[__name__],), make, fits=fits)
             else:
@@ -157,9 +157,9 @@ class Probe:
 
     def posed_points(self, bodies: Floats) -> Floats:
         """Return the hand points (B, N, 3) for body poses (B, L, 7), object frame [m]."""
-        return _turned(bodies, self.points.body, self.points.position) + bodies[:, self.points.body, :3]
+        return _rotate_with_bodies(bodies, self.points.body, self.points.position) + bodies[:, self.points.body, :3]
 
-    def touch(self, posture: Posture, *, reach: float = REACH_M) -> NearestPoints:
+    def nearest_points(self, posture: Posture, *, reach: float = REACH_M) -> NearestPoints:
         """Return the object's surface near the hand points of B postures, within `reach` [m]."""
         bodies = body_poses(self.hand, posture.hand_pose, posture.joint_positions)
         points = self.posed_points(bodies)
@@ -168,7 +168,7 @@ class Probe:
         return NearestPoints(
             bodies=bodies,
             hand_points=points,
-            hand_normals=_turned(bodies, self.points.body, self.points.normal),
+            hand_normals=_rotate_with_bodies(bodies, self.points.body, self.points.normal),
             distance=distance.reshape(shape),
             closest=closest.reshape(*shape, 3),
             normal=normal.reshape(*shape, 3),
@@ -176,14 +176,14 @@ class Probe:
 
     def measure(self, posture: Posture) -> Distances:
         """Measure all distances of B postures from the object, within `REACH_M`."""
-        found = self.touch(posture)
+        found = self.nearest_points(posture)
         return Distances(
             **vars(found),
             piece_distance=self._piece_distances(found.bodies),
             self_depth=self.self_depth(found.bodies, found.hand_points).max(axis=1),
         )
 
-    def facing(self, found: NearestPoints) -> NDArray[np.bool_]:
+    def facing_mask(self, found: NearestPoints) -> NDArray[np.bool_]:
         """Return a mask (B, N) of points whose hand surface faces the object; other points cannot press."""
         return np.asarray(np.einsum("bni,bni->bn", found.hand_normals, found.normal) < FACING_COS)
 
@@ -220,12 +220,12 @@ class Probe:
         return [self.pieces, position, rotation]
 
 
-def _turned(bodies: Floats, body: NDArray[np.integer[Any]], vectors: Floats) -> Floats:
+def _rotate_with_bodies(bodies: Floats, body: NDArray[np.integer[Any]], vectors: Floats) -> Floats:
     """Rotate vectors (N, 3) with their bodies (N,); return (B, N, 3)."""
     return np.asarray(np.einsum("bnij,nj->bni", quat_to_matrix(bodies[..., 3:])[:, body], vectors))
 
 
-def _by_body(points: SurfacePoints, bodies: int) -> Any:
+def _upload_points(points: SurfacePoints, bodies: int) -> Any:
     """Return points of a hand as `kernels.distance.BodyPoints`, on the current device."""
     order = np.argsort(points.body, kind="stable")
     first = np.searchsorted(points.body[order], np.arange(bodies + 1))

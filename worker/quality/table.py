@@ -21,7 +21,7 @@ from graspd.service.store.manifests import INDEX_THRESHOLD_M
 from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.disk_cache import content_of
+from graspd.worker.objects.disk_cache import content_digest
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.region import WHOLE, ContactRegion
 from graspd.worker.quality.contact import LINK_CONTACT_M, MAX_CONTACTS, contact_area_cm2, contact_links, spread_contacts
@@ -29,7 +29,7 @@ from graspd.worker.quality.diversity import approach_cells
 from graspd.worker.quality.grasp_type import ContactPattern
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, probe_of
 from graspd.worker.quality.volume import Overlap, SharedVolume, penetration_depth
-from graspd.worker.quality.wrench_space import measure_spaces, wrenches
+from graspd.worker.quality.wrench_space import contact_wrenches, measure_spaces
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -110,7 +110,7 @@ class _Terms:
     @cached_property
     def pair(self) -> _Pair:
         """Prepared hand and object, cached because a batch is measured in chunks of a few grasps."""
-        content = content_of(self)
+        content = content_digest(self)
         with _lock:
             if content not in _pairs:
                 _pairs[content] = _Pair(self)
@@ -131,7 +131,7 @@ def _measure_chunks(terms: _Terms, postures: Sequence[Posture], done: Count, run
     if run.pool is not None:
         return run.pool.map(
             _columns,
-            content_of(terms),
+            content_digest(terms),
             terms,
             postures,
             cancelled=run.cancelled,
@@ -170,12 +170,12 @@ class _Chunk:
     def spaces(self) -> tuple[Floats, Floats]:
         """Epsilon and volume (B, T) of the wrench spaces of B grasps."""
         pair, found, obj = self.pair, self.found, self.pair.obj
-        near = pair.probe.facing(found)[:, None] & (np.abs(found.distance)[:, None] < pair.thresholds[:, None])
+        near = pair.probe.facing_mask(found)[:, None] & (np.abs(found.distance)[:, None] < pair.thresholds[:, None])
         chosen, count = spread_contacts(near, found.closest, found.normal, scale=obj.radius, limit=MAX_CONTACTS)
         rows = np.arange(len(chosen))[:, None, None]
         counts = (np.arange(MAX_CONTACTS) < count[..., None])[..., None]
         place, inward = found.closest[rows, chosen], np.where(counts, -found.normal[rows, chosen], [0.0, 0.0, 1.0])
-        edges = wrenches(place, inward, friction=pair.friction, centre=obj.centre_of_mass, radius=obj.radius)
+        edges = contact_wrenches(place, inward, friction=pair.friction, centre=obj.centre_of_mass, radius=obj.radius)
         wanted = np.broadcast_to(pair.with_volume, count.shape)
         epsilon, volume = measure_spaces(edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel())
         return epsilon.reshape(count.shape), volume.reshape(count.shape)
@@ -190,8 +190,8 @@ class _Chunk:
         # A face may enter a piece between object points, but a point is within half a diagonal of their grid.
         near = self.found.piece_distance < self.pair.probe.sample_spacing
         if self.pair.volume.is_exact:
-            near = self.pair.overlap.of(self.found, near)
-        return self.pair.volume.of(self.found.bodies, near)
+            near = self.pair.overlap.overlapping_pieces(self.found, near)
+        return self.pair.volume.volumes(self.found.bodies, near)
 
 
 #: Metrics of B grasps: (B, T) if swept over thresholds, else (B,). `GRASP_METRICS` has their units.

@@ -33,23 +33,23 @@ class SharedVolume:
     def __init__(self, hand: HandModel, obj: ObjectModel) -> None:
         self.hand, self.obj = hand, obj
         self._pieces = [
-            _solid(p.vertices, p.faces)
+            _build_manifold(p.vertices, p.faces)
             or m3d.Manifold.hull_points(np.ascontiguousarray(p.vertices * _UNIT, np.float32))
             for p in hand.pieces
         ]
         self._body = np.array([p.body for p in hand.pieces], np.intp)
-        self._object = _solid(obj.vertices - obj.centre_of_mass, obj.faces)
+        self._object = _build_manifold(obj.vertices - obj.centre_of_mass, obj.faces)
 
     @property
     def is_exact(self) -> bool:
         return self._object is not None
 
-    def of(self, bodies: Floats, near: NDArray[np.bool_]) -> Floats:
+    def volumes(self, bodies: Floats, near: NDArray[np.bool_]) -> Floats:
         """Compute the volume (B,) inside both the object and the union of the hand's pieces [cm^3].
         The bodies are at (B, L, 7) in the object frame; only pieces `near` (B, P) count."""
-        return np.array([self._one(bodies[b], np.flatnonzero(near[b])) for b in range(len(bodies))])
+        return np.array([self._volume_of_hand(bodies[b], np.flatnonzero(near[b])) for b in range(len(bodies))])
 
-    def _one(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:
+    def _volume_of_hand(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:
         if not len(pieces):
             return 0.0
         if self._object is None:
@@ -88,7 +88,7 @@ class SharedVolume:
         return float((depth < 0).sum()) * VOXEL_M**3 * 1e6
 
 
-def _solid(vertices: Floats, faces: NDArray[np.int32]) -> m3d.Manifold | None:
+def _build_manifold(vertices: Floats, faces: NDArray[np.int32]) -> m3d.Manifold | None:
     mesh = m3d.Mesh(
         vert_properties=np.ascontiguousarray(vertices * _UNIT, dtype=np.float32),
         tri_verts=np.ascontiguousarray(faces, dtype=np.uint32),
@@ -114,20 +114,20 @@ class Overlap:
             wp.load_module(module=kernels, device="cpu")
         self._solids = _solids(hand.pieces)
 
-    def of(self, found: Distances, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def overlapping_pieces(self, found: Distances, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return a mask (B, P) of those `near` (B, P) pieces that may share volume with the object."""
         row, piece = np.nonzero(near)
         if not len(row):
             return near
         poses = found.bodies[row, self._body[piece]]
-        meets = self._crossed(piece, poses) | (found.piece_distance[row, piece] < 0)
+        meets = self._crossing_mask(piece, poses) | (found.piece_distance[row, piece] < 0)
         rest = np.flatnonzero(~meets)
         meets[rest] = self._probe.signed_distance(apply(poses[rest], self._corner[piece[rest]]))[0] < 0
         out = np.zeros_like(near)
         out[row, piece] = meets
         return out
 
-    def _crossed(self, piece: NDArray[np.intp], poses: Floats) -> NDArray[np.bool_]:
+    def _crossing_mask(self, piece: NDArray[np.intp], poses: Floats) -> NDArray[np.bool_]:
         centre = self._probe.obj.centre_of_mass
         given = np.concatenate([poses[:, :3] - centre, to_xyzw(poses[:, 3:])], axis=1)
         with wp.ScopedDevice("cpu"):

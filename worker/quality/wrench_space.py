@@ -43,7 +43,7 @@ def cone_edges(normals: Floats, friction: float, *, edges: int = EDGES) -> Float
     return np.asarray(np.asarray(normals, float)[..., None, :] + friction * around)
 
 
-def wrenches(
+def contact_wrenches(
     points: Floats, normals: Floats, *, friction: float, centre: Floats, radius: float, edges: int = EDGES
 ) -> Floats:
     """Return edge wrenches (..., E, 6): force, then torque about `centre` divided by `radius` [m].
@@ -78,7 +78,7 @@ def _measure_by_qhull(edge_wrenches: Floats) -> tuple[float, float]:
     from scipy.spatial import ConvexHull, QhullError
 
     points = edge_wrenches.reshape(-1, edge_wrenches.shape[-1])
-    if len(points) <= points.shape[1] or _flat(points):
+    if len(points) <= points.shape[1] or _is_flat(points):
         return 0.0, 0.0
     # Joggled input is fastest and gives simplices; exact merging is the fallback.
     for options in ("QJ", "Qt Qx"):
@@ -90,7 +90,7 @@ def _measure_by_qhull(edge_wrenches: Floats) -> tuple[float, float]:
     return 0.0, 0.0
 
 
-def _flat(points: Floats) -> bool:
+def _is_flat(points: Floats) -> bool:
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(spread[-1] <= FLATNESS * max(spread[0], 1e-300))
 
@@ -134,7 +134,7 @@ class _Workspace(threading.local):
         self.marks = wp.array(marks, dtype=wp.int64, device="cpu")
         self.next_stamp = 1
 
-    def stamps(self, count: int) -> int:
+    def reserve_stamps(self, count: int) -> int:
         """Return the first of `count` stamps that no entry of the table uses."""
         if self.next_stamp + count > _LAST_STAMP:
             self.hull.stamp.zero_()
@@ -193,7 +193,7 @@ def _grow_hulls(
                 wp.array(-middle, dtype=kernels.vec6),
                 wp.array(_ROUNDING * scale, dtype=wp.float64),
                 space.marks,
-                space.stamps(len(points) * points.shape[1]),
+                space.reserve_stamps(len(points) * points.shape[1]),
             ],
             outputs=[space.hull, result],
             device="cpu",

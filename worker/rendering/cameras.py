@@ -157,7 +157,7 @@ class _Camera(_Model):
     target: _Row3 | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> _Camera:
+    def _require_one_placement(self) -> _Camera:
         looks = self.eye is not None and self.target is not None
         if (self.extrinsics is not None) == looks or (self.eye is None) != (self.target is None):
             raise ValueError("a camera has either extrinsics or eye and target")
@@ -182,11 +182,13 @@ def read_cameras(path: Path) -> GivenCameras:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     except ValidationError as error:
         raise InputError(f"{path}: {first_error(error)}") from None
-    extrinsics = None if file.cameras is None else np.stack([_place(path, k, c) for k, c in enumerate(file.cameras)])
-    return GivenCameras(_matrix(path, file.intrinsics), extrinsics, file.width, file.height)
+    extrinsics = (
+        None if file.cameras is None else np.stack([_camera_extrinsics(path, k, c) for k, c in enumerate(file.cameras)])
+    )
+    return GivenCameras(_intrinsic_matrix(path, file.intrinsics), extrinsics, file.width, file.height)
 
 
-def _matrix(path: Path, given: _Pinhole | list[list[float]] | None) -> Floats | None:
+def _intrinsic_matrix(path: Path, given: _Pinhole | list[list[float]] | None) -> Floats | None:
     if given is None:
         return None
     if isinstance(given, _Pinhole):
@@ -199,7 +201,7 @@ def _matrix(path: Path, given: _Pinhole | list[list[float]] | None) -> Floats | 
     return k
 
 
-def _place(path: Path, number: int, camera: _Camera) -> Floats:
+def _camera_extrinsics(path: Path, number: int, camera: _Camera) -> Floats:
     if camera.extrinsics is None:
         eye, target = np.array(camera.eye, float), np.array(camera.target, float)
         if np.linalg.norm(target - eye) < 1e-9:

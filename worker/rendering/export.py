@@ -37,7 +37,7 @@ def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> 
         raise InputError(f"{folder} cannot be created: {error.strerror}; give another folder as --output") from None
     if any(folder.glob("view_*.json")):
         raise InputError(f"{folder} contains exported views already; give another folder as --output")
-    written = [_json(folder / "labels.json", _labels(views))]
+    written = [_write_json(folder / "labels.json", _labels(views))]
     for view in range(len(views["camera/eye"])):
         written += _export_view(views, view, folder, depth)
     return written
@@ -50,12 +50,12 @@ def _export_view(views: Shard, view: int, folder: Path, depth: DepthFormat) -> l
     written = [
         export_png(path("rgb", "png"), views["image/rgb"][view]),
         export_png(path("semantic_segmentation", "png"), views["image/segmentation"][view]),
-        _json(path("view", "json"), describe(views, view)),
+        _write_json(path("view", "json"), describe(views, view)),
     ]
     for dataset, name in _DISTANCES.items():
         if dataset in views.arrays:
             metres, file = np.asarray(views[dataset][view], np.float32), path(name, depth)
-            written.append(export_exr(file, "Z", [metres]) if depth == "exr" else _png_metres(file, metres))
+            written.append(export_exr(file, "Z", [metres]) if depth == "exr" else _export_depth_png(file, metres))
     if "image/normals" in views.arrays:
         written.append(export_exr(path("normals", "exr"), "XYZ", np.moveaxis(views["image/normals"][view], -1, 0)))
     if "image/rgb_hand" in views.arrays:
@@ -100,7 +100,7 @@ def export_png(path: Path, pixels: NDArray[Any]) -> Path:
     return path
 
 
-def _png_metres(path: Path, metres: NDArray[np.float32]) -> Path:
+def _export_depth_png(path: Path, metres: NDArray[np.float32]) -> Path:
     steps = np.where(np.isfinite(metres), np.asarray(metres, float) / PNG_STEP_M, 0.0)
     # Distances beyond 16 bits are clipped to the largest value instead of wrapping round.
     return export_png(path, np.clip(np.rint(steps), 0, 65535).astype(np.uint16))
@@ -115,6 +115,6 @@ def export_exr(path: Path, names: str, planes: Sequence[NDArray[Any]] | NDArray[
     return path
 
 
-def _json(path: Path, value: dict[str, Any]) -> Path:
+def _write_json(path: Path, value: dict[str, Any]) -> Path:
     path.write_text(json.dumps(value, allow_nan=False) + "\n")
     return path

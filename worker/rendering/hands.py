@@ -12,7 +12,7 @@ import numpy as np
 from cachetools import LRUCache, cached
 from numpy.typing import NDArray
 
-from graspd.service.model.colours import Colour, hexadecimal, linear
+from graspd.service.model.colours import Colour, linear_rgb, linear_rgb_from_hex
 from graspd.service.model.transforms import Floats
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
@@ -22,9 +22,9 @@ from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.objects.topology import join_meshes
 from graspd.worker.rendering.scenery import Appearance, Solid
 
-_HAND: Final = Appearance(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)
-_PALM: Final = Appearance(hexadecimal("#434b54"), roughness=0.48, metalness=0.35)
-_TIP: Final = Appearance(hexadecimal("#2fa7a0"), roughness=0.38)
+_HAND: Final = Appearance(linear_rgb_from_hex("#59636e"), roughness=0.42, metalness=0.35)
+_PALM: Final = Appearance(linear_rgb_from_hex("#434b54"), roughness=0.48, metalness=0.35)
+_TIP: Final = Appearance(linear_rgb_from_hex("#2fa7a0"), roughness=0.38)
 _AWAY_M: Final = -50.0  # z of a hidden hand [m]: under the floor, out of every picture
 
 
@@ -63,7 +63,7 @@ class MovingSolid:
 def hand_parts(hand: HandModel) -> tuple[MovingSolid, ...]:
     """Return the visual meshes of a hand in their colours; for bodies without any, collision pieces.
     Without a stated colour, palm, fingers and fingertips have default appearances."""
-    return tuple(_drawn(hand))
+    return tuple(_hand_solids(hand))
 
 
 def drawn_parts(hand: HandModel, *, mounted: bool) -> tuple[MovingSolid, ...]:
@@ -90,7 +90,7 @@ def drawn_bodies(hand: HandModel) -> list[int]:
     return [part.body for part in hand_parts(hand)]
 
 
-def _drawn(hand: HandModel) -> Iterator[MovingSolid]:
+def _hand_solids(hand: HandModel) -> Iterator[MovingSolid]:
     seen = {mesh.body for mesh in hand.visuals.meshes}
     for body in range(hand.bodies):
         of_colour = defaultdict[Colour | None, list[tuple[Floats, Ints]]](list)
@@ -101,11 +101,13 @@ def _drawn(hand: HandModel) -> Iterator[MovingSolid]:
             if piece.body == body and body not in seen:
                 of_colour[None].append((piece.vertices, piece.faces))
         for colour, meshes in of_colour.items():
-            look = _own_look(hand, body) if colour is None else Appearance(linear(*colour), roughness=0.45)
+            look = (
+                _default_appearance(hand, body) if colour is None else Appearance(linear_rgb(*colour), roughness=0.45)
+            )
             yield MovingSolid(body, _merge(meshes), look)
 
 
-def _own_look(hand: HandModel, body: int) -> Appearance:
+def _default_appearance(hand: HandModel, body: int) -> Appearance:
     if body in hand.fingertips:
         return _TIP
     return _PALM if body == 0 else _HAND

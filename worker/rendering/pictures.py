@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.colours import hexadecimal
+from graspd.service.model.colours import linear_rgb_from_hex
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import move_poses
@@ -35,7 +35,7 @@ _FILL: Final = 0.86  # share of the picture's width or height that hand and obje
 TOWARD_LAMP: Final = np.array([0.45, -0.45, 0.77]) / np.linalg.norm([0.45, -0.45, 0.77])
 FLOOR_SIZE: Final = (6.0, 6.0, 0.02)
 FLOOR: Final = Appearance((1.0, 1.0, 1.0), pattern=CATCHER)
-OBJECT_LOOK: Final = Appearance(hexadecimal("#dd7432"), roughness=0.5)
+OBJECT_LOOK: Final = Appearance(linear_rgb_from_hex("#dd7432"), roughness=0.5)
 STUDIO: Final = Lamp(
     key=(1.85, 1.8, 1.7),
     sky=(0.76, 0.79, 0.84),
@@ -68,12 +68,12 @@ def grasp_pictures(
     for start in range(0, len(hand_pose), _TOGETHER):
         part = slice(start, start + _TOGETHER)
         bodies = body_poses(hand, hand_pose[part], joints[part])
-        shots.append(_shoot(stage, hand, obj, bodies, size, azimuths, samples, run))
+        shots.append(_render_sides(stage, hand, obj, bodies, size, azimuths, samples, run))
     empty = np.zeros((0, len(azimuths), size[1], size[0], 3), np.uint8)
     return np.concatenate([empty, *shots])
 
 
-def _shoot(
+def _render_sides(
     stage: Tracer,
     hand: HandModel,
     obj: ObjectModel,
@@ -92,8 +92,8 @@ def _shoot(
     sides = []
     for azimuth in azimuths:
         angles = np.array([side_azimuth(hand, world) + azimuth for world in bodies])
-        cameras = np.stack([_camera(obj, points[w], angles[w], k, size) for w in range(worlds)])
-        sides.append(stage.shoot(studio_shot(cameras, k, size, angles, samples), run.without_progress()).rgb)
+        cameras = np.stack([_fit_grasp_camera(obj, points[w], angles[w], k, size) for w in range(worlds)])
+        sides.append(stage.render(studio_shot(cameras, k, size, angles, samples), run.without_progress()).rgb)
     return np.stack(sides, axis=1)
 
 
@@ -137,7 +137,7 @@ def side_azimuth(hand: HandModel, bodies: Floats) -> float:
     return float(np.arctan2(flat[1], flat[0]) + 0.5 * np.pi)
 
 
-def _camera(obj: ObjectModel, points: Floats, angle: float, k: Floats, size: tuple[int, int]) -> Floats:
+def _fit_grasp_camera(obj: ObjectModel, points: Floats, angle: float, k: Floats, size: tuple[int, int]) -> Floats:
     middle = 0.5 * (obj.hull_vertices.min(axis=0) + obj.hull_vertices.max(axis=0))
     reach = np.linalg.norm(obj.hull_vertices - middle, axis=1).max()
     return fit_camera(points[np.linalg.norm(points - middle, axis=1) < reach + NEAR_M], angle, k, size)

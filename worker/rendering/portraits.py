@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw
 
-from graspd.service.model.colours import hexadecimal
+from graspd.service.model.colours import linear_rgb_from_hex
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_from_matrix
 from graspd.worker.hands.closing import closing_posture
@@ -32,7 +32,7 @@ _CAPTION: Final = 30
 _COLUMNS: Final = 3
 #: Share of the motion from open to closed at which a hand is shown closing.
 _CLOSING_SHARE: Final = 0.6
-_ARROW: Final = Appearance(hexadecimal("#dd7432"), roughness=0.5)
+_ARROW: Final = Appearance(linear_rgb_from_hex("#dd7432"), roughness=0.5)
 _ARROW_SHARE: Final = 0.4  # ratio of the arrow's length to the largest extent of the hand
 #: Azimuths of the views [rad]: the approach points mainly right in the first, and towards the camera in the second.
 _HAND_AZIMUTHS: Final = tuple(np.radians([32.0, 122.0]).tolist())
@@ -41,7 +41,7 @@ _OBJECT_AZIMUTHS: Final = tuple(np.radians([-50.0, 40.0, 130.0]).tolist())
 
 def hand_portrait(hand: HandModel) -> Image.Image:
     """Draw the hand open, in its pre-shape and closing, from two sides, with an arrow for the approach."""
-    parts, upright = hand_parts(hand), _upright(hand)
+    parts, upright = hand_parts(hand), _upright_pose(hand)
     named = {
         "open": closing_posture(hand, 0.0),
         "pre-shape": hand.preshape,
@@ -58,7 +58,7 @@ def hand_portrait(hand: HandModel) -> Image.Image:
     azimuths = np.repeat(_HAND_AZIMUTHS, len(named))
     looks = [*(part.look for part in parts), _ARROW]
     solids = [*(part.solid for part in parts), arrow]
-    return _page(_shoot(solids, np.tile(poses, (2, 1, 1)), looks, points, azimuths), [*named] * 2)
+    return _compose_page(_render_worlds(solids, np.tile(poses, (2, 1, 1)), looks, points, azimuths), [*named] * 2)
 
 
 def object_portrait(obj: ObjectModel) -> Image.Image:
@@ -68,7 +68,9 @@ def object_portrait(obj: ObjectModel) -> Image.Image:
     extents = " x ".join(f"{1e3 * extent:.0f}" for extent in np.ptp(obj.vertices, axis=0))
     captions = [f"{obj.name}, {extents} mm", f"{len(obj.faces)} faces", f"within {1e3 * obj.deviation_m:.2f} mm"]
     poses = np.tile(IDENTITY_POSE, (len(captions), 1, 1))
-    return _page(_shoot([solid], poses, [pictures.OBJECT_LOOK], obj.vertices, _OBJECT_AZIMUTHS), captions)
+    return _compose_page(
+        _render_worlds([solid], poses, [pictures.OBJECT_LOOK], obj.vertices, _OBJECT_AZIMUTHS), captions
+    )
 
 
 def write_png(image: Image.Image, path: Path) -> None:
@@ -79,7 +81,7 @@ def write_png(image: Image.Image, path: Path) -> None:
         raise InputError(f"{path} cannot be written: {error.strerror}") from None
 
 
-def _shoot(
+def _render_worlds(
     solids: Sequence[Solid], poses: Floats, looks: list[Appearance], points: Floats, azimuths: ArrayLike
 ) -> NDArray[np.uint8]:
     """Render N worlds (N, H, W, 3), each from its azimuth; every camera frames the same points."""
@@ -90,10 +92,10 @@ def _shoot(
     k = intrinsics(*SIZE, pictures.FIELD_OF_VIEW)
     angles = np.asarray(azimuths, float)
     cameras = np.stack([pictures.fit_camera(points, angle, k, SIZE) for angle in angles])
-    return stage.shoot(pictures.studio_shot(cameras, k, SIZE, angles, _SAMPLES)).rgb
+    return stage.render(pictures.studio_shot(cameras, k, SIZE, angles, _SAMPLES)).rgb
 
 
-def _page(shown: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
+def _compose_page(shown: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
     width, height = SIZE[0], SIZE[1] + _CAPTION
     page = Image.new("RGB", (_COLUMNS * width, len(shown) // _COLUMNS * height), sheets.PAPER)
     draw = ImageDraw.Draw(page)
@@ -104,7 +106,7 @@ def _page(shown: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
     return page.quantize(192, dither=Image.Dither.NONE)
 
 
-def _upright(hand: HandModel) -> Floats:
+def _upright_pose(hand: HandModel) -> Floats:
     """Return the root pose with fingertips up and the approach along +y, to the right seen from +x."""
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(closing_posture(hand, 0.0)))[0]
     centres = {piece.body: apply(poses[piece.body], piece.vertices).mean(axis=0) for piece in hand.pieces}

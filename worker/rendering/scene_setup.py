@@ -14,7 +14,7 @@ import numpy as np
 from cachetools import LRUCache
 from numpy.random import Generator
 
-from graspd.service.model.colours import Colour, hexadecimal, linear
+from graspd.service.model.colours import Colour, linear_rgb, linear_rgb_from_hex
 from graspd.service.model.scene_spec import Box as BoxSupport
 from graspd.service.model.scene_spec import HalfSpace
 from graspd.service.model.transforms import Floats, apply
@@ -77,7 +77,7 @@ class CameraPlan:
         return np.stack([eye for middle in middles for eye in stereo_pair(middle, self.baseline_m)])
 
 
-class Setting:
+class SceneSetup:
     """Scenes of one object, its neighbours and supports, ready for rendering."""
 
     def __init__(
@@ -111,29 +111,31 @@ class Setting:
             lamps=[scene.lamp for scene in scenes],
         )
 
-    def shoot(self, run: ExecutionContext, *, normals: bool = False) -> Pictures:
+    def render(self, run: ExecutionContext, *, normals: bool = False) -> Pictures:
         """Render the pictures; `Pictures.shape` is 0 for supports, 1 for the object, 2 + m for neighbour m."""
-        return self._named(self.stage(run.device).shoot(replace(self.shot, normals=normals), run))
+        return self._with_object_indices(self.stage(run.device).render(replace(self.shot, normals=normals), run))
 
-    def shoot_alone(self, run: ExecutionContext) -> Pictures:
+    def render_object_alone(self, run: ExecutionContext) -> Pictures:
         """Trace one ray per pixel of the object alone; `Pictures.shape` is 1 where it is visible."""
         poses = self._poses.copy()
         poses[:, [k for k in range(poses.shape[1]) if k != len(self._slabs)], 2] = _AWAY_M
-        return self._named(self.stage(run.device, poses).shoot(replace(self.shot, samples=1, shaded=False), run))
+        return self._with_object_indices(
+            self.stage(run.device, poses).render(replace(self.shot, samples=1, shaded=False), run)
+        )
 
-    def shoot_with(self, drawn: DrawnHand, run: ExecutionContext) -> Pictures:
+    def render_with_hand(self, drawn: DrawnHand, run: ExecutionContext) -> Pictures:
         key = (*self._key(), drawn.hand.content, drawn.wrist is not None, run.device)
         stage = _cached_tracer(key, lambda: [*self._solids(), *(part.solid for part in drawn.parts)], run.device)
         looks = [[*looks, *(part.look for part in drawn.parts)] for looks in self.looks]
         stage.place(np.concatenate([self._poses, drawn.body_poses()], axis=1), looks)
-        return self._named(stage.shoot(self.shot, run))
+        return self._with_object_indices(stage.render(self.shot, run))
 
     def stage(self, device: str, poses: Floats | None = None) -> Tracer:
         stage = _cached_tracer((*self._key(), device), self._solids, device)
         stage.place(self._poses if poses is None else poses, self.looks)
         return stage
 
-    def _named(self, pictures: Pictures) -> Pictures:
+    def _with_object_indices(self, pictures: Pictures) -> Pictures:
         extra = len(self._slabs) - 1
         return replace(pictures, shape=np.where(pictures.shape < 0, -1, np.maximum(pictures.shape - extra, 0)))
 
@@ -173,15 +175,15 @@ def _unobstructed_cameras(draw: Callable[[], list[Floats]], supports: Supports, 
     if not any(isinstance(s, BoxSupport) for s in supports):
         return drawn
 
-    def seen(camera: Floats) -> float:
+    def visible_share_from(camera: Floats) -> float:
         return scenery.visible_share(supports, -camera[:3, :3].T @ camera[:3, 3], points)
 
-    share = [seen(camera) for camera in drawn]
+    share = [visible_share_from(camera) for camera in drawn]
     for _ in range(_DRAWS):
         if min(share) >= _SEEN:
             break
         for k, camera in enumerate(draw()):
-            if share[k] < _SEEN and (found := seen(camera)) > share[k]:
+            if share[k] < _SEEN and (found := visible_share_from(camera)) > share[k]:
                 drawn[k], share[k] = camera, found
     return drawn
 
@@ -194,7 +196,7 @@ def _cached_tracer(key: tuple[object, ...], solids: Callable[[], Sequence[Solid 
 
 def hsv(hue: float, saturation: float, value: float) -> Colour:
     """Convert hue, saturation, value in 0..1 to linear RGB."""
-    return linear(*colorsys.hsv_to_rgb(hue % 1.0, saturation, value))
+    return linear_rgb(*colorsys.hsv_to_rgb(hue % 1.0, saturation, value))
 
 
 def draw_table_look(rng: Generator) -> Appearance:
@@ -203,14 +205,20 @@ def draw_table_look(rng: Generator) -> Appearance:
     scale = float(rng.uniform(0.7, 1.5))
     if kind == 0:
         base, second = _WOODS[rng.integers(len(_WOODS))]
-        return Appearance(hexadecimal(base), hexadecimal(second), GRAIN, scale, float(rng.uniform(0.45, 0.8)))
+        return Appearance(
+            linear_rgb_from_hex(base), linear_rgb_from_hex(second), GRAIN, scale, float(rng.uniform(0.45, 0.8))
+        )
     if kind == 1:
         base, second = _STONES[rng.integers(len(_STONES))]
-        return Appearance(hexadecimal(base), hexadecimal(second), SPECKLE, scale, float(rng.uniform(0.5, 0.8)))
+        return Appearance(
+            linear_rgb_from_hex(base), linear_rgb_from_hex(second), SPECKLE, scale, float(rng.uniform(0.5, 0.8))
+        )
     base = _CLOTHS[rng.integers(len(_CLOTHS))]
     if kind == 2:
-        return Appearance(hexadecimal(base), hexadecimal("#8b8883"), TILES, scale, float(rng.uniform(0.45, 0.7)))
-    return Appearance(hexadecimal(base), pattern=PLAIN, roughness=float(rng.uniform(0.7, 0.95)))
+        return Appearance(
+            linear_rgb_from_hex(base), linear_rgb_from_hex("#8b8883"), TILES, scale, float(rng.uniform(0.45, 0.7))
+        )
+    return Appearance(linear_rgb_from_hex(base), pattern=PLAIN, roughness=float(rng.uniform(0.7, 0.95)))
 
 
 def draw_object_look(rng: Generator) -> Appearance:

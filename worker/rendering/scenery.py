@@ -130,11 +130,13 @@ def visible_share(supports: Supports, eye: Floats, points: Floats) -> float:
             normal, length = np.asarray(support.normal), float(np.linalg.norm(support.normal))
             hidden |= bool(normal @ eye < support.offset - 1e-9 * length)
         else:
-            hidden |= _crosses(eye, points, _box_pose(support), np.asarray(support.size) / 2)
+            hidden |= _crossing_mask(eye, points, _box_pose(support), np.asarray(support.size) / 2)
     return 1.0 - float(hidden.mean())
 
 
-def _crosses(eye: Floats, points: Floats, pose: Floats, half: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _crossing_mask(
+    eye: Floats, points: Floats, pose: Floats, half: Floats
+) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Return a mask (P,) of points whose line to the eye crosses a box (Kay and Kajiya 1986)."""
     inside = invert(pose)
     start = quat_rotate(inside[3:], eye) + inside[:3]

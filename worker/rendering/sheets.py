@@ -85,7 +85,7 @@ def contact_sheet(
     """Return a PNG of N pictures (N, H, W, 3) in a grid, ranked 1..N, with label and value pairs below."""
     rows = -(-max(1, len(pictures)) // columns)
     height, width = pictures.shape[1:3]
-    page, draw, top = _page(columns, rows, width, height + _CAPTION, title, subtitle)
+    page, draw, top = _create_page(columns, rows, width, height + _CAPTION, title, subtitle)
     for k, picture in enumerate(pictures):
         x = MARGIN + (k % columns) * (width + GAP)
         y = top + (k // columns) * (height + _CAPTION + GAP)
@@ -108,12 +108,12 @@ def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
     eye = np.asarray(views["camera/eye"])
     stereo, first = bool((eye == 2).any()), np.flatnonzero(eye != 2)
     columns: dict[str, Callable[[int], Image.Image]] = {
-        "left" if stereo else "colour": lambda view: _colours(views, "image/rgb", view),
-        "right": lambda view: _colours(views, "image/rgb", view + 1),
-        "depth": lambda view: _depth(views, view),
-        "segmentation": lambda view: _segments(views, view),
-        "boxes": lambda view: _boxes(views, view),
-        "hand": lambda view: _colours(views, "image/rgb_hand", view),
+        "left" if stereo else "colour": lambda view: _colour_image(views, "image/rgb", view),
+        "right": lambda view: _colour_image(views, "image/rgb", view + 1),
+        "depth": lambda view: _draw_depth(views, view),
+        "segmentation": lambda view: _draw_segmentation(views, view),
+        "boxes": lambda view: _draw_boxes(views, view),
+        "hand": lambda view: _colour_image(views, "image/rgb_hand", view),
     }
     heads = [head for head in columns if (stereo or head != "right") and (head != "hand" or "image/rgb_hand" in views)]
     rows = [[columns[head](view) for head in heads] for view in first.tolist()]
@@ -125,8 +125,8 @@ def scene_cells(views: Arrays) -> list[Image.Image]:
     left, right = np.asarray(views["image/rgb"][:2], np.uint8)
     normals = np.asarray(views["image/normals"][0], float)
     coloured = np.where(normals.any(axis=-1, keepdims=True), 127.5 + 127.5 * normals, 214).round().astype(np.uint8)
-    cells = [Image.fromarray(left), Image.fromarray(right), _depth(views, 0), Image.fromarray(coloured)]
-    return [*cells, _segments(views, 0), _boxes(views, 0)]
+    cells = [Image.fromarray(left), Image.fromarray(right), _draw_depth(views, 0), Image.fromarray(coloured)]
+    return [*cells, _draw_segmentation(views, 0), _draw_boxes(views, 0)]
 
 
 def label_page(
@@ -140,7 +140,7 @@ def label_page(
     """Return a PNG of pictures in rows under `heads`; `names`, if any, are below a row's first pictures."""
     width, height = rows[0][0].size
     line = height + (_NAME if names else 0)
-    page, draw, top = _page(len(heads), len(rows), width, line, title, subtitle, head=_HEAD + 24)
+    page, draw, top = _create_page(len(heads), len(rows), width, line, title, subtitle, head=_HEAD + 24)
     for column, head in enumerate(heads):
         draw_text(draw, (MARGIN + column * (width + GAP), top - 10), head, 15, QUIET)
     for row, (cells, below) in enumerate(zip(rows, names or [()] * len(rows), strict=True)):
@@ -152,7 +152,7 @@ def label_page(
     return png_bytes(page)
 
 
-def _page(
+def _create_page(
     columns: int, rows: int, width: int, height: int, title: str, subtitle: str, head: int = _HEAD
 ) -> tuple[Image.Image, ImageDraw.ImageDraw, int]:
     """Return an empty page with its title, and the y at which the cells begin."""
@@ -177,11 +177,11 @@ def _caption(
         draw_text(draw, (left + k * step, y + 35), value, 14, INK)
 
 
-def _colours(views: Arrays, path: str, view: int) -> Image.Image:
+def _colour_image(views: Arrays, path: str, view: int) -> Image.Image:
     return Image.fromarray(np.asarray(views[path][view], np.uint8))
 
 
-def _depth(views: Arrays, view: int) -> Image.Image:
+def _draw_depth(views: Arrays, view: int) -> Image.Image:
     depth = np.asarray(views["image/depth"][view], np.float32)
     solid = np.asarray(views["image/segmentation"][view]) == OBJECT
     finite = depth[np.isfinite(depth)]
@@ -209,14 +209,14 @@ def _scale_bar(image: Image.Image, near: float, far: float) -> None:
     draw_text(draw, (x + ramp + 6, y + thick + 1), f"{far:.2f} m", 11, INK)
 
 
-def _segments(views: Arrays, view: int) -> Image.Image:
+def _draw_segmentation(views: Arrays, view: int) -> Image.Image:
     """Draw the labels; neighbours cycle through the colours after the object's."""
     labels = np.asarray(views["image/segmentation"][view], np.intp)
     beside = OBJECT + 1 + (labels - OBJECT - 1) % (len(_SEGMENT) - OBJECT - 1)
     return Image.fromarray(_SEGMENT[np.where(labels > OBJECT, beside, labels)])
 
 
-def _boxes(views: Arrays, view: int) -> Image.Image:
+def _draw_boxes(views: Arrays, view: int) -> Image.Image:
     rgb = np.asarray(views["image/rgb"][view], float)
     # Dimmed, so that the lines are visible on any material.
     table = np.asarray(views["image/segmentation"][view])[..., None] <= TABLE
@@ -285,6 +285,6 @@ def png_bytes(image: Image.Image) -> bytes:
     return buffer.getvalue()
 
 
-def with_palette(page: bytes) -> bytes:
+def reduce_to_palette(page: bytes) -> bytes:
     """Return the PNG in 256 colours, for documentation: a third of the bytes."""
     return png_bytes(Image.open(io.BytesIO(page)).convert("RGB").quantize(256, method=Image.Quantize.MEDIANCUT))

@@ -39,7 +39,7 @@ _R2: Final = np.array([0.7548776662466927, 0.5698402909980532])
 
 
 class Tracer:
-    """Solids in many worlds. Build once, then `place` and `shoot` repeatedly."""
+    """Solids in many worlds. Build once, then `place` and `render` repeatedly."""
 
     def __init__(self, solids: Sequence[Solid | Box], device: str) -> None:
         """Load the P solids of every world to a Warp device."""
@@ -72,10 +72,10 @@ class Tracer:
         placed["place"], placed["turn"] = poses[..., :3], np.swapaxes(quat_to_matrix(poses[..., 3:]), -1, -2)
         placed["lower"], placed["upper"] = corners.min(axis=2) - _SLACK_M, corners.max(axis=2) + _SLACK_M
         self._placed: Any = wp.array(placed, dtype=_PLACED, device=self.device)
-        every = _structs([look for world in looks for look in world], Material, self.device)
+        every = _struct_array([look for world in looks for look in world], Material, self.device)
         self._materials: Any = every.reshape(poses.shape[:2])
 
-    def shoot(self, shot: CameraShot, run: ExecutionContext = DEFAULT_CONTEXT) -> Pictures:
+    def render(self, shot: CameraShot, run: ExecutionContext = DEFAULT_CONTEXT) -> Pictures:
         """Trace all cameras.
         The threads of `run` share the rows of each picture; a GPU takes many pictures at once. `run` receives the
         number of finished pictures. Raises TaskCancelled: `run.cancelled()` returned True; polled before launches."""
@@ -83,23 +83,23 @@ class Tracer:
         threads = 1 if cuda else min(run.cores, shot.height)
         count, pixels = len(shot.world), len(shot.world) * shot.height * shot.width
         launches = -(-pixels // (PIXELS_OF_A_GPU if cuda else PIXELS_OF_A_CORE * threads))
-        film, exposed = _Film(self, shot), []
+        film, exposed = _ShotRenderer(self, shot), []
         with ThreadPoolExecutor(threads, thread_name_prefix="rendering") as pool:
             for views in np.array_split(np.arange(count), min(count, launches)):
                 run.check("the rendering")
-                exposed.append(film.expose(views, threads, pool))
+                exposed.append(film.render_views(views, threads, pool))
                 run.progress(float(views[-1] + 1), float(count), f"rendering {count} pictures")
         rgb, depth, shape, normal = (np.concatenate(parts) for parts in zip(*exposed, strict=True))
         return Pictures(rgb, depth, shape.astype(np.int64), normal if shot.normals else None)
 
 
-class _Film:
+class _ShotRenderer:
     """Pictures of one shot, exposed a few views at a time."""
 
     def __init__(self, tracer: Tracer, shot: CameraShot) -> None:
         self._tracer, self._shot, device = tracer, shot, tracer.device
         passes = light_passes(shot.samples, shot.toward_lamp)
-        self._passes = _structs(passes, exposure.LightPass, device)
+        self._passes = _struct_array(passes, exposure.LightPass, device)
         # Worlds turn under the lamp, so in their frames lamp and sky turn in the opposite direction.
         back = transforms.quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), -np.asarray(shot.turn))
         toward = quat_rotate(back[:, None], np.array([one.toward for one in passes]))
@@ -107,7 +107,7 @@ class _Film:
         poses = transforms.pose_from_matrix(np.asarray(np.linalg.inv(shot.extrinsics), np.float64))
         self._cameras = np.asarray(poses[..., [0, 1, 2, 4, 5, 6, 3]], np.float32)
 
-    def expose(self, views: NDArray[np.intp], threads: int, pool: ThreadPoolExecutor) -> tuple[NDArray[Any], ...]:
+    def render_views(self, views: NDArray[np.intp], threads: int, pool: ThreadPoolExecutor) -> tuple[NDArray[Any], ...]:
         """Return colour, depth, shapes and normals of some views; each thread takes rows of all pictures."""
         tracer, shot, device = self._tracer, self._shot, self._tracer.device
         size, world, k = (len(views), shot.height, shot.width), shot.world[views], shot.intrinsics
@@ -120,7 +120,7 @@ class _Film:
             tracer._materials,
             wp.array(world, dtype=wp.int32, device=device),
             wp.array(self._cameras[views], dtype=wp.transformf, device=device),
-            _structs([shot.lamps[w] for w in world], Light, device),
+            _struct_array([shot.lamps[w] for w in world], Light, device),
             wp.vec2f(k[0, 0], k[1, 1]),
             wp.vec2f(k[0, 2], k[1, 2]),
             self._passes,
@@ -130,15 +130,15 @@ class _Film:
         ]
         outputs = [rgb, depth, shape, normal]
 
-        def rows(first: int) -> None:
+        def render_rows(first: int) -> None:
             dim = (size[0], len(range(first, size[1], threads)), size[2])
             wp.launch(exposure.expose, dim=dim, inputs=[*inputs, first], outputs=outputs, device=device)
 
-        list(pool.map(rows, range(threads)))
+        list(pool.map(render_rows, range(threads)))
         return tuple(array.numpy() for array in outputs)
 
 
-def _structs(things: Sequence[Any], struct: Any, device: str) -> Any:
+def _struct_array(things: Sequence[Any], struct: Any, device: str) -> Any:
     """Return an array of Warp structs, filled from attributes of equal names."""
     kind = np.dtype(struct.numpy_dtype())
     rows = [tuple(getattr(thing, name) for name in kind.names or ()) for thing in things]
@@ -164,14 +164,14 @@ def light_passes(samples: int, toward_lamp: Floats) -> list[LightPass]:
     for k in range(samples):
         across, down = ((0.5 + k * _R2) % 1.0 - 0.5).tolist()
         if k % 2 == 0:
-            lamp = _on_disc(toward_lamp, k // 2, lamp_passes)
+            lamp = _disc_direction(toward_lamp, k // 2, lamp_passes)
             passes.append(LightPass((across, down), lamp, samples / lamp_passes, 0.0))
         else:
-            passes.append(LightPass((across, down), _on_sky(k // 2, sky_passes), 0.0, sky))
+            passes.append(LightPass((across, down), _sky_direction(k // 2, sky_passes), 0.0, sky))
     return passes
 
 
-def _on_disc(axis: Floats, k: int, count: int) -> Floats:
+def _disc_direction(axis: Floats, k: int, count: int) -> Floats:
     radius, angle = LAMP_RADIUS * np.sqrt((k + 0.5) / count), _GOLDEN * k
     side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
@@ -179,7 +179,7 @@ def _on_disc(axis: Floats, k: int, count: int) -> Floats:
     return np.asarray(direction / np.linalg.norm(direction))
 
 
-def _on_sky(k: int, count: int) -> Floats:
+def _sky_direction(k: int, count: int) -> Floats:
     # Uniform over the sky above the haze of the horizon, since low lights would cast long streaks.
     height, angle = 1.0 - (1.0 - SKY_EDGE) * (k + 0.5) / count, _GOLDEN * k
     level = np.sqrt(1.0 - height**2)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from graspd.service.model.colours import hexadecimal
+from graspd.service.model.colours import linear_rgb_from_hex
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import HalfSpace
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose
@@ -40,9 +40,9 @@ _GLANCE: Final = 48  # edge of the pictures that rate the sides [px]
 #: Direction of the lamp under a board: from the front, as high as a window.
 _UNDER_A_BOARD: Final = np.array([0.85, -0.42, 0.32]) / np.linalg.norm([0.85, -0.42, 0.32])
 _HIGH_M: Final = 3.0
-_TABLE: Final = Appearance(hexadecimal("#b9bfc2"), roughness=0.85)
-_WALL: Final = Appearance(hexadecimal("#7f97a5"), roughness=0.8)
-_BESIDE: Final = Appearance(hexadecimal("#8d86a3"), roughness=0.6)
+_TABLE: Final = Appearance(linear_rgb_from_hex("#b9bfc2"), roughness=0.85)
+_WALL: Final = Appearance(linear_rgb_from_hex("#7f97a5"), roughness=0.8)
+_BESIDE: Final = Appearance(linear_rgb_from_hex("#8d86a3"), roughness=0.6)
 
 
 @dataclass(frozen=True)
@@ -83,11 +83,11 @@ def trajectory_pictures(
     frames the whole hand; else far parts may be cut off. Raises TaskCancelled: `run.cancelled()` returned True."""
     if not frames:
         return np.zeros((0, sides, 0, size[1], size[0], 3), np.uint8)
-    stage = _Stage(hand, obj, around, len(frames[0]), run, np.inf if whole else studio.NEAR_M)
-    return np.stack([stage.shoot(number, way, size, sides, samples) for number, way in enumerate(frames)])
+    stage = _GraspRenderer(hand, obj, around, len(frames[0]), run, np.inf if whole else studio.NEAR_M)
+    return np.stack([stage.render(number, way, size, sides, samples) for number, way in enumerate(frames)])
 
 
-class _Stage:
+class _GraspRenderer:
     """One tracer for all grasps: its worlds are the frames of one grasp."""
 
     def __init__(
@@ -110,7 +110,7 @@ class _Stage:
         planes = [_TABLE if isinstance(s, HalfSpace) else _WALL for s in around.supports] or [studio.FLOOR]
         self.looks = [*planes, studio.OBJECT_LOOK, *(_BESIDE for _ in self.others), *(part.look for part in parts)]
 
-    def shoot(
+    def render(
         self, number: int, way: Sequence[Waypoint], size: tuple[int, int], sides: int, samples: int
     ) -> NDArray[np.uint8]:
         """Render one grasp (A, F, H, W, 3)."""
@@ -136,7 +136,7 @@ class _Stage:
         for angle, height in self._best_sides(grasp, near, studio.side_azimuth(self.hand, bodies[grasp]), sides):
             cameras = np.stack([studio.fit_camera(near, angle, k, size, elevation=height)] * self.frames)
             shot = studio.studio_shot(cameras, k, size, np.full(self.frames, angle), samples, toward_lamp=lamp)
-            pictures.append(self.tracer.shoot(shot, self.run.without_progress()).rgb)
+            pictures.append(self.tracer.render(shot, self.run.without_progress()).rgb)
         return np.stack(pictures)
 
     def _place(self, scene: int, things: Floats, drawn: Floats, floor: Floats, middle: Floats) -> None:
@@ -159,7 +159,7 @@ class _Stage:
         size, worlds = (_GLANCE, _GLANCE), np.full(len(sides), world)
         k = intrinsics(*size, studio.FIELD_OF_VIEW)
         glance = studio.studio_shot(cameras, k, size, np.full(self.frames, first), 1, world=worlds)
-        seen = self.tracer.shoot(replace(glance, shaded=False), self.run.without_progress()).shape
+        seen = self.tracer.render(replace(glance, shaded=False), self.run.without_progress()).shape
         thing = len(self.boxes)
         first_of_hand = thing + 1 + len(self.others)
         # Links above the hand's root, such as a forearm, do not count.

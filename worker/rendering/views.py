@@ -18,7 +18,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.annotate import box_corners, occlusion_ratio, tight_boxes
 from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, Cameras, GivenCameras
 from graspd.worker.rendering.hands import DrawnHand
-from graspd.worker.rendering.scene_setup import CameraPlan, Setting
+from graspd.worker.rendering.scene_setup import CameraPlan, SceneSetup
 from graspd.worker.rendering.scenery import TABLE, Pictures, Supports
 from graspd.worker.scenes.neighbours import Neighbours
 
@@ -80,20 +80,20 @@ def render(
     beside = (extras.neighbours or Neighbours((), np.zeros((len(poses), 0, 7)))).centred
     obj, poses = obj.centred, to_centred_frame(poses, obj.centre)
     placed = np.concatenate([poses[:, None], beside.poses], axis=1)
-    setting = Setting([obj, *beside.objects], placed, plan, seed=seed, samples=samples, supports=extras.supports)
-    pictures = setting.shoot(run, normals="normals" in extras.channels)
+    setting = SceneSetup([obj, *beside.objects], placed, plan, seed=seed, samples=samples, supports=extras.supports)
+    pictures = setting.render(run, normals="normals" in extras.channels)
     result = annotate(setting, pictures, obj, extras.channels)
     if "occlusion" in extras.channels:
-        alone = setting.shoot_alone(run.without_progress()).shape == 1
+        alone = setting.render_object_alone(run.without_progress()).shape == 1
         result["box/occlusion_ratio"] = occlusion_ratio(np.asarray(result["image/segmentation"], np.uint8), alone)
     if extras.drawn is not None:
-        seen = setting.shoot_with(extras.drawn, run.without_progress())
+        seen = setting.render_with_hand(extras.drawn, run.without_progress())
         result["image/rgb_hand"] = seen.rgb
         result["camera/hand_grasp"] = extras.drawn.grasp[setting.shot.world].astype(np.int32)
     return result
 
 
-def annotate(setting: Setting, pictures: Pictures, obj: ObjectModel, channels: Sequence[str] = ()) -> Arrays:
+def annotate(setting: SceneSetup, pictures: Pictures, obj: ObjectModel, channels: Sequence[str] = ()) -> Arrays:
     """Compute the datasets of a views shard that follow from cameras and pictures."""
     shot, plan = setting.shot, setting.plan
     cameras = Cameras(plan.width, plan.height, shot.intrinsics, shot.extrinsics)

@@ -58,7 +58,7 @@ def transfer_grasps(
     for part in np.array_split(np.arange(len(grasp)), -(-len(grasp) // _CHUNK)) if len(grasp) else ():
         some, before = grasp.take(part), pregrasp.take(part)
         wrist[:, part], mounted = _mounting_clearance(hand, some, before, poses)
-        clearance[:, part] = np.minimum(_clearance(hand, some, before, poses), mounted)
+        clearance[:, part] = np.minimum(_table_clearance(hand, some, before, poses), mounted)
     scenes, grasps = len(poses), len(grasp)
     at_contact, on_the_way = clearance.reshape(-1, 2).T
     rejection = np.where(on_the_way < MARGIN_M, Rejection.TABLE_ON_APPROACH, Rejection.NONE)
@@ -118,9 +118,9 @@ def _neighbour_clearance(
     return np.stack([distance[..., -1], distance.min(axis=2)], axis=-1)
 
 
-def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> Floats:
+def _table_clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> Floats:
     """Return heights (S, N, 2) of the hand's lowest point at contact and on approach, table frame [m]."""
-    features = PosedFeatures.of(hand, approach_postures(grasp, pregrasp))
+    features = PosedFeatures.create(hand, approach_postures(grasp, pregrasp))
     on_path = np.array([features.distance(_TABLE.in_frame(pose)).min(axis=1) for pose in object_pose])
     on_path = on_path.reshape(len(object_pose), len(grasp), -1)
     return np.stack([on_path[..., -1], on_path.min(axis=2)], axis=-1)
@@ -130,7 +130,7 @@ def _mounting_clearance(
     hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats
 ) -> tuple[Floats, Floats]:
     """Return wrist angles (S, N, K) and lowest heights (S, N, 2) of the mounting [m]; inf without it.
-    The heights are those at contact and on the approach, as in `_clearance`."""
+    The heights are those at contact and on the approach, as in `_table_clearance`."""
     path = approach_postures(grasp, pregrasp).hand_pose.reshape(len(grasp), PATH_POSTURES, 7)
     angles, heights, which = [], [], np.zeros(len(grasp), np.intp)
     for pose in object_pose:

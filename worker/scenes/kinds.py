@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from graspd.service.model.errors import SceneError
-from graspd.service.model.scene_spec import BIN_SIZE, MOST_TOUCH, SHELF_SIZE, Box, SceneSpec, supports_in
+from graspd.service.model.scene_spec import BIN_SIZE, MOST_TOUCH, SHELF_SIZE, Box, SceneSpec, scene_supports
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_from_axis_angle, quat_rotate
 from graspd.worker.grasps import move_poses
 from graspd.worker.objects.model import ObjectModel
@@ -28,7 +28,7 @@ def supports_of(spec: SceneSpec) -> tuple[Obstacle, ...]:
     """Return the supports in the scene frame; none for a free object."""
     found = (
         Obstacle.box(s.pose, s.size) if isinstance(s, Box) else Obstacle.half_space(s.normal, s.offset)
-        for s in supports_in(spec)
+        for s in scene_supports(spec)
     )
     return tuple(found) if spec.touch >= MOST_TOUCH else tuple(replace(o, tips_m=1e-3 * spec.touch) for o in found)
 
@@ -46,7 +46,7 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
         poses = np.tile(np.asarray(spec.target, float), (count, 1))
         found = _rest_columns(poses, np.ones(count))
     elif spec.faces == "all":
-        found = _each_face(obj, seed)
+        found = _rest_on_each_face(obj, seed)
     else:
         found = drop(obj, count=count, seed=seed)
     poses = found["scene/object_pose"]
@@ -54,7 +54,7 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
         rngs = [np.random.default_rng([seed, scene]) for scene in range(len(poses))]
         poses = np.array([move_inside(obj, pose, size, rng) for pose, rng in zip(poses, rngs, strict=True)])
     poses = poses if spec.target is not None else move_poses(poses, np.zeros(3))
-    check_free(obj, poses, supports_of(spec))
+    require_no_penetration(obj, poses, supports_of(spec))
     return {**found, "scene/object_pose": poses}
 
 
@@ -63,7 +63,7 @@ def _rest_columns(poses: Floats, probability: Floats) -> dict[str, Floats]:
     return {"scene/object_pose": poses, "scene/rest_probability": probability, "scene/drop_seconds": seconds}
 
 
-def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
+def _rest_on_each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
     """Return one scene per stable face on which at least `LEAST_PROBABILITY` of drops end.
     Faces on which the object rolls are used only if there are no others."""
     faces = resting_faces(obj)
@@ -102,7 +102,7 @@ def move_inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: 
     return np.concatenate([rng.uniform(-room - low, room - high), pose[2:]])
 
 
-def check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) -> None:
+def require_no_penetration(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) -> None:
     """Raise SceneError if the object at a pose (S, 7) penetrates a support by more than `SUNK`."""
     for pose in poses:
         corners = apply(pose, obj.hull_vertices)

@@ -23,7 +23,7 @@ from graspd.worker.objects.mesh_geometry import to_centred_frame, to_file_frame
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes import simulate
 from graspd.worker.scenes.kinds import GAP, SUNK, rotate_about_vertical
-from graspd.worker.scenes.rest import lay_flat, resting_faces, settle
+from graspd.worker.scenes.rest import lay_flat, resting_faces, stable_face_below
 from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation.model import add_shape
 
@@ -63,8 +63,8 @@ def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count:
             f"scenes need 1 to {MOST_NEIGHBOURS} neighbours, and a number and a seed of at least 0; "
             f"got {count} scenes, {len(neighbours)} neighbours, seed {seed}"
         )
-    heap = _Heap([one.centred for one in (obj, *neighbours)])
-    found = [heap.redo_until_rest((seed, scene)) for scene in range(count)]
+    heap = _DroppedObjects([one.centred for one in (obj, *neighbours)])
+    found = [heap.drop_until_rest((seed, scene)) for scene in range(count)]
     poses = move_poses(np.array([poses for poses, _, _ in found]).reshape(count, 1 + len(neighbours), 7), np.zeros(3))
     for number, one in enumerate((obj, *neighbours)):
         poses[:, number] = to_file_frame(poses[:, number], one.centre)
@@ -76,7 +76,7 @@ def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count:
     }
 
 
-class _Heap:
+class _DroppedObjects:
     """Objects that fall together onto a table."""
 
     def __init__(self, objects: Sequence[ObjectModel]) -> None:
@@ -85,7 +85,7 @@ class _Heap:
         self.model = simulate.model_above_table(objects)
         self.data = mujoco.MjData(self.model)
 
-    def redo_until_rest(self, key: tuple[int, int]) -> tuple[Floats, int, float]:
+    def drop_until_rest(self, key: tuple[int, int]) -> tuple[Floats, int, float]:
         """Drop until all objects rest; return poses (1 + M, 7), the object's resting face, and seconds."""
         for attempt in range(simulate.MAX_ATTEMPTS):
             if (found := self._drop_once(np.random.default_rng([*key, attempt]))) is not None:
@@ -143,7 +143,7 @@ class _Heap:
         flat, first = [], -1
         for k, (obj, pose) in enumerate(zip(self.objects, self.data.qpos.reshape(-1, 7).copy(), strict=True)):
             pose[3:] /= np.linalg.norm(pose[3:])
-            face, angle = settle(self.faces[k], pose[3:])
+            face, angle = stable_face_below(self.faces[k], pose[3:])
             laid = lay_flat(self.faces[k], face, pose)
             middle = apply(laid, obj.centre_of_mass)
             lift = abs(float(middle[2] - apply(pose, obj.centre_of_mass)[2]))
@@ -248,13 +248,13 @@ def _draw_poses(
 ) -> Floats | None:
     """Draw poses (1 + M, 7) of one scene; None if a neighbour does not fit."""
     placed = [target]
-    middle = hulls.middle(0, target)
+    middle = hulls.horizontal_centre(0, target)
     for number, rest in enumerate(resting, start=1):
         far = reach * (hulls.objects[0].radius + hulls.objects[number].radius)
         for _ in range(_PLACES):
             pose = rotate_about_vertical(rest, rng.uniform(0, 2 * np.pi))
             low, high = hulls.shift_range(number, pose)
-            centre = hulls.middle(number, pose)
+            centre = hulls.horizontal_centre(number, pose)
             low, high = np.maximum(low, middle - far - centre), np.minimum(high, middle + far - centre)
             if (low > high).any():
                 continue
@@ -282,7 +282,7 @@ class _Hulls:
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
 
-    def middle(self, number: int, pose: Floats) -> Floats:
+    def horizontal_centre(self, number: int, pose: Floats) -> Floats:
         """Return the horizontal position (2,) of an object's centre of mass [m]."""
         return apply(pose, self.objects[number].centre_of_mass)[:2]
 

@@ -20,7 +20,7 @@ from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.mesh_geometry import to_centred_frame, to_file_frame
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.topology import outward_hull
-from graspd.worker.scenes.kinds import SUNK, check_free, move_inside, rest_poses, supports_of, walled_area
+from graspd.worker.scenes.kinds import SUNK, move_inside, require_no_penetration, rest_poses, supports_of, walled_area
 from graspd.worker.scenes.neighbours import drop_together, place_neighbours
 from graspd.worker.simulation.environment import Neighbour, Obstacle, Scenes
 from graspd.worker.validation.decomposition import decompose
@@ -37,11 +37,11 @@ def neighbour_of(obj: ObjectModel) -> Neighbour:
         middle, by = neighbour_of(obj.centred), np.array([*obj.centre, 1.0, 0, 0, 0])
         pieces = tuple(piece + by[:3] for piece in middle.pieces)
         return Neighbour(obj, pieces, tuple(solid.moved(by) for solid in middle.solids), middle.error_m, middle)
-    return replace(_neighbour(obj), obj=obj)  # the same mesh may have another name
+    return replace(_build_neighbour(obj), obj=obj)  # the same mesh may have another name
 
 
 @cached_by_content(32)
-def _neighbour(obj: ObjectModel) -> Neighbour:
+def _build_neighbour(obj: ObjectModel) -> Neighbour:
     try:
         pieces = decompose(obj).vertices
     except MeshError:
@@ -57,10 +57,10 @@ def merge_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Flo
     left = list(pieces)
     volume = [union_volume((piece,)) for piece in left]
 
-    def added(a: int, b: int) -> float:
+    def added_volume(a: int, b: int) -> float:
         return union_volume((np.concatenate([left[a], left[b]]),)) - volume[a] - volume[b]
 
-    cost = {(a, b): added(a, b) for a, b in combinations(range(len(left)), 2)} if len(left) > most else {}
+    cost = {(a, b): added_volume(a, b) for a, b in combinations(range(len(left)), 2)} if len(left) > most else {}
     alive = set(range(len(left)))
     while len(alive) > most:
         a, b = min(cost, key=lambda pair: cost[pair])
@@ -68,7 +68,7 @@ def merge_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Flo
         volume.append(union_volume((left[-1],)))
         alive -= {a, b}
         cost = {pair: value for pair, value in cost.items() if not {a, b} & set(pair)}
-        cost |= {(k, len(left) - 1): added(k, len(left) - 1) for k in alive}
+        cost |= {(k, len(left) - 1): added_volume(k, len(left) - 1) for k in alive}
         alive.add(len(left) - 1)
     return tuple(left[k] for k in sorted(alive))
 
@@ -119,12 +119,12 @@ def _scenes_of(
         except MeshError:
             # With too many objects, no drop ends with all of them apart.
             poses = _place_objects(SceneSpec(kind="table"), obj, others, supports, count=count, seed=seed)
-        check_free(obj, poses["scene/object_pose"], supports)
+        require_no_penetration(obj, poses["scene/object_pose"], supports)
     else:
         poses = _place_objects(spec, obj, others, supports, count=count, seed=seed)
     beside = tuple(neighbour_of(other) for other in others)
     for number, other in enumerate(others):
-        check_free(other, poses["scene/neighbour_pose"][:, number], supports)
+        require_no_penetration(other, poses["scene/neighbour_pose"][:, number], supports)
     if given:
         whole = np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
         _check_apart([neighbour_of(obj), *beside], whole)
@@ -144,12 +144,12 @@ def _place_objects(
     poses = rest_poses(spec, obj, count=count, seed=seed)
     alone, size = poses["scene/object_pose"], walled_area(spec)
 
-    def again(scene: int, draw: int) -> Floats:
+    def draw_pose(scene: int, draw: int) -> Floats:
         if size is None or not draw:
             return alone[scene]
         return move_inside(obj, alone[scene], size, np.random.default_rng([seed, scene, draw]))
 
-    found, beside = place_neighbours(obj, again, others, supports, within=size, count=len(alone), seed=seed)
+    found, beside = place_neighbours(obj, draw_pose, others, supports, within=size, count=len(alone), seed=seed)
     return {**poses, "scene/object_pose": found, "scene/neighbour_pose": beside}
 
 

@@ -45,7 +45,7 @@ class RestingFaces:
     def stable_faces(self) -> Ints:
         return np.flatnonzero(self.successor == np.arange(len(self.successor))).astype(np.int32)
 
-    def looseness(self, face: int) -> tuple[float, float]:
+    def possible_motion(self, face: int) -> tuple[float, float]:
         """Return the possible rotation [rad] and descent [m] of an object at rest on `face`.
         A change of the surface by `CHANGE_M` tilts the face. The object then tips over all edges that its centre of
         mass crosses."""
@@ -62,17 +62,17 @@ class RestingFaces:
 
     def can_topple(self, face: int) -> bool:
         """Check whether a change of the surface by `CHANGE_M` lets the object fall to a lower face."""
-        return self.looseness(face)[1] > CHANGE_M
+        return self.possible_motion(face)[1] > CHANGE_M
 
     def can_roll(self, face: int) -> bool:
         """Check whether a change of the surface by `CHANGE_M` may turn the object by more than `ROLLS`."""
-        return self.looseness(face)[0] > ROLLS
+        return self.possible_motion(face)[0] > ROLLS
 
 
-def rolling_poses(obj: ObjectModel, poses: Floats) -> int:
+def count_rolling_poses(obj: ObjectModel, poses: Floats) -> int:
     """Count the rest poses (S, 7) on a table in which the object may roll, see `RestingFaces.can_roll`."""
     faces = resting_faces(obj.centred)
-    return sum(faces.can_roll(settle(faces, pose[3:])[0]) for pose in np.asarray(poses, float))
+    return sum(faces.can_roll(stable_face_below(faces, pose[3:])[0]) for pose in np.asarray(poses, float))
 
 
 def rolling_note(rolling: int, scenes: int) -> str | None:
@@ -133,7 +133,7 @@ def _edges(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floats) -
     return sides.astype(np.int32), margins, widths
 
 
-def settle(faces: RestingFaces, quaternion: Floats) -> tuple[int, float]:
+def stable_face_below(faces: RestingFaces, quaternion: Floats) -> tuple[int, float]:
     """Return the stable face below the object, and the angle by which it turns to lie flat [rad].
     Start at the most downward face and tip over edges until a face is stable."""
     down = quat_rotate(np.asarray(quaternion) * np.array([1.0, -1, -1, -1]), np.array([0.0, 0.0, -1.0]))

@@ -37,7 +37,7 @@ FALLS: Final = 0.4
 BEST: Final = 0.99
 
 
-def rollout_on(
+def create_rollout(
     run: ExecutionContext,
     hand: HandModel,
     obj: ObjectModel,
@@ -112,10 +112,10 @@ def lift_rollout(
         score[held[~way.clear]] += BLOCKED
         free = np.flatnonzero(way.clear)
         coming = replace(mine, approach=way.approach, coming=way.open).take(free)
-        score[held[free]] = lifted(coming, where.take(free), score[held[free]], beat[held[free]])
+        score[held[free]] = lift_scores(coming, where.take(free), score[held[free]], beat[held[free]])
         return score
 
-    def lifted(grasps: GraspSet, placed: PlacedGrasps, score: Floats, beat: Floats) -> Floats:
+    def lift_scores(grasps: GraspSet, placed: PlacedGrasps, score: Floats, beat: Floats) -> Floats:
         lift = partial(validate_lifts, hand, obj, level=level, pieces=pieces(), known=known, run=run)
         out, hard, found = np.maximum(score, SLIPS), np.zeros(len(score), bool), beat < SLIPS + 1.0
         some = np.flatnonzero(score < SLIPS)
@@ -192,7 +192,7 @@ def scene_verdicts(
     return grasps, columns
 
 
-def outcomes_in_scenes(columns: Arrays) -> dict[str, NDArray[np.bool_]]:
+def outcome_masks(columns: Arrays) -> dict[str, NDArray[np.bool_]]:
     """Return masks (N,) of grasps that are clear, lifted, and lifted at half friction (`scene_verdicts`)."""
     clear = np.asarray(columns["quality/success"] >= 0)
     if "quality/lift_outcome" not in columns:

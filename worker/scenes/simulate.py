@@ -23,7 +23,7 @@ from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.mesh_geometry import to_file_frame
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes import rest as resting
-from graspd.worker.scenes.rest import RestingFaces, lay_flat, resting_faces, same_face_mask, settle
+from graspd.worker.scenes.rest import RestingFaces, lay_flat, resting_faces, same_face_mask, stable_face_below
 
 #: Density of the object; its value has no effect on the motion of a free body on a plane [kg/m^3].
 DENSITY: Final = 500.0
@@ -70,10 +70,10 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     seed is negative. MeshError: the hull is flat, or the object never comes to rest."""
     if count < 0 or seed < 0:
         raise InputError(f"scenes and seed must not be negative; got {count} scenes, seed {seed}")
-    table = _build(obj.centred)
+    table = _build_table(obj.centred)
     rests = []
     for scene in range(count):
-        rest, rng = _redo_until_rest(table, (seed, scene)), np.random.default_rng([seed, scene, MAX_ATTEMPTS])
+        rest, rng = _drop_until_rest(table, (seed, scene)), np.random.default_rng([seed, scene, MAX_ATTEMPTS])
         face, pose = settle_on_face(obj.centred, table.faces, rest.face, rest.pose, rng)
         rests.append(RestPose(pose, face, rest.seconds))
     poses = move_poses(np.array([rest.pose for rest in rests]).reshape(count, 7), np.zeros(3))
@@ -116,8 +116,8 @@ def _reference_faces(obj: ObjectModel) -> tuple[int, ...]:
     code = (sys.modules[__name__], resting)
 
     def drops() -> dict[str, NDArray[Any]]:
-        table = _build(obj)
-        rests = [_redo_until_rest(table, (_REFERENCE_SEED, k)) for k in range(REFERENCE_DROPS)]
+        table = _build_table(obj)
+        rests = [_drop_until_rest(table, (_REFERENCE_SEED, k)) for k in range(REFERENCE_DROPS)]
         return {"face": np.array([rest.face for rest in rests])}
 
     def fits(kept: Mapping[str, NDArray[Any]]) -> bool:
@@ -169,12 +169,12 @@ def add_hull(spec: Any, body: Any, name: str, vertices: Floats, faces: NDArray[A
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **options)
 
 
-def _build(obj: ObjectModel) -> _Table:
+def _build_table(obj: ObjectModel) -> _Table:
     model = model_above_table([obj])
     return _Table(model, mujoco.MjData(model), resting_faces(obj), obj)
 
 
-def _redo_until_rest(table: _Table, key: tuple[int, int]) -> RestPose:
+def _drop_until_rest(table: _Table, key: tuple[int, int]) -> RestPose:
     for attempt in range(MAX_ATTEMPTS):
         if (rest := _drop_once(table, np.random.default_rng([*key, attempt]))) is not None:
             return rest
@@ -194,7 +194,7 @@ def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
     if seconds is None or is_invalid(data):
         return None
     quaternion = data.qpos[3:] / np.linalg.norm(data.qpos[3:])
-    face, angle = settle(table.faces, quaternion)
+    face, angle = stable_face_below(table.faces, quaternion)
     if angle > MAX_SETTLE_ANGLE or table.faces.can_topple(face):
         return None
     pose = lay_flat(table.faces, face, np.concatenate([data.qpos[:3], quaternion]))

@@ -81,7 +81,7 @@ def plan_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed:
     lifted[..., :3] += np.linspace(0, 1, WAYPOINTS)[:, None] * rise[:, None]
     taken = np.concatenate([closing_hand.hand_pose.reshape(count, PATH_POSTURES, 7)[:, ::4], lifted], axis=1)
     wrist, mounting = choose_wrist(hand, taken, scenes, which)
-    path, came, coming, touching = open_approach(probe, grasps.pregrasp, wide, wrist, placed)
+    path, came, coming, touching = plan_open_approach(probe, grasps.pregrasp, wide, wrist, placed)
     before = room(approach_postures(grasps.pregrasp, Posture(grasps.pregrasp.hand_pose, came)))
     joints = np.repeat(grasps.grasp.joint_positions, WAYPOINTS, axis=0)
     lifting = room(Posture(lifted.reshape(-1, 7), joints), WAYPOINTS).min(axis=1)
@@ -103,7 +103,7 @@ def plan_free_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet) ->
     nowhere = PlacedGrasps((), IDENTITY_POSE[None], np.zeros(len(grasps), np.intp))
     wide = _open_pregrasps(probe, grasps.pregrasp, wide_open_joints(hand, obj, grasps.pregrasp, nowhere))
     pointing = quat_rotate(wide.hand_pose[:, 3:], hand.palm.approach)
-    ways = [-pointing, *(_tilted(-pointing, tilt, side) for tilt in TILTS for side in range(SIDES))]
+    ways = [-pointing, *(_tilt_axes(-pointing, tilt, side) for tilt in TILTS for side in range(SIDES))]
     path, _, touching, chosen = _plan_approach(probe, wide, nowhere.scenes[0], ways)
     raised = np.array(grasps.squeeze.hand_pose, float)
     raised[:, :3] += STANDOFF_M * chosen
@@ -116,10 +116,10 @@ def plan_free_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet) ->
 def _open_pregrasps(probe: Probe, pregrasp: Posture, joints: Floats) -> Posture:
     """Return pregrasps opened to `joints` (n, J), unless that moves the fingers closer to the object."""
     start = np.asarray(pregrasp.joint_positions, float)
-    room = np.minimum(OBJECT_MARGIN_M, _gaps(probe, pregrasp)) - 5e-4
+    room = np.minimum(OBJECT_MARGIN_M, _object_distances(probe, pregrasp)) - 5e-4
     nearer = np.zeros(len(start), bool)
     for share in (1 / 3, 2 / 3, 1.0):
-        nearer |= _gaps(probe, Posture(pregrasp.hand_pose, start + share * (joints - start))) < room
+        nearer |= _object_distances(probe, Posture(pregrasp.hand_pose, start + share * (joints - start))) < room
     return Posture(np.array(pregrasp.hand_pose, float), np.where(nearer[:, None], start, joints))
 
 
@@ -129,7 +129,7 @@ def _unit(ways: Floats, instead: Floats) -> Floats:
     return np.where(length > 1e-6, ways / np.maximum(length, 1e-6), instead)
 
 
-def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
+def _tilt_axes(axis: Floats, tilt: float, side: int) -> Floats:
     """Return unit vectors (n, 3) tilted by `tilt` [rad] from axes (n, 3), towards side number `side`."""
     least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
     across = _unit(np.cross(axis, least), least)
@@ -137,7 +137,7 @@ def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
     return quat_rotate(quat_from_axis_angle(axis, np.full(len(axis), 2 * np.pi * side / SIDES)), leaning)
 
 
-def _retreat(hand_pose: Floats, way: Floats, steps: int) -> Floats:
+def _retreat_poses(hand_pose: Floats, way: Floats, steps: int) -> Floats:
     """Return poses (n, steps, 7) from `STANDOFF_M` along directions `way` (n, 3) to the hands' poses."""
     poses = np.repeat(hand_pose[:, None], steps, axis=1)
     poses[..., :3] += np.linspace(STANDOFF_M, 0.0, steps)[:, None] * way[:, None]
@@ -154,11 +154,11 @@ def _plan_approach(
     chosen, open_ = np.zeros((count, 3)), np.arange(count)
     for tried in ways:
         way = tried[open_]
-        poses = _retreat(pregrasp.hand_pose[open_], way, looks)
+        poses = _retreat_poses(pregrasp.hand_pose[open_], way, looks)
         joints = np.repeat(pregrasp.joint_positions[open_], looks, axis=0)
         postures = Posture(poses.reshape(-1, 7), joints)
         room = obstacle_clearance(probe.hand, postures, [scene]).reshape(len(open_), looks).min(axis=1)
-        gap = _gaps(probe, postures).reshape(len(open_), looks)
+        gap = _object_distances(probe, postures).reshape(len(open_), looks)
         # The pregrasp itself may be closer than the margin; the approach may then be as close, but not closer.
         hits = gap[:, :-1].min(axis=1) < np.minimum(OBJECT_MARGIN_M, gap[:, -1]) - 5e-4
         score = np.minimum(room, MARGIN_M) - hits
@@ -168,10 +168,10 @@ def _plan_approach(
         open_ = open_[best[open_] < MARGIN_M]
         if not len(open_):
             break
-    return _retreat(pregrasp.hand_pose, chosen, WAYPOINTS), least, touching, chosen
+    return _retreat_poses(pregrasp.hand_pose, chosen, WAYPOINTS), least, touching, chosen
 
 
-def _gaps(probe: Probe, postures: Posture) -> Floats:
+def _object_distances(probe: Probe, postures: Posture) -> Floats:
     """Return least distances (P,) of hand points from the object and of object points from the hand [m]."""
     found = probe.measure(postures)
     return np.minimum(found.distance.min(axis=1), found.piece_distance.min(axis=1))
@@ -193,7 +193,7 @@ SHARES_UP: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
 OPENNESS: Final = (1.0, 0.5, 0.0)
 
 
-def open_approach(
+def plan_open_approach(
     probe: Probe, pregrasp: Posture, wide: Floats, wrist: Floats, placed: PlacedGrasps
 ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
     """Return approaches with the hand as wide open as possible, its fingers away from the object.
@@ -218,7 +218,7 @@ def open_approach(
         open_ = open_[best[open_] < MARGIN_M + 0.1 * OBJECT_WANTED_M - 1e-9]
         if not len(open_):
             break
-    return _retreat(pregrasp.hand_pose, chosen, WAYPOINTS), joints, least, touching
+    return _retreat_poses(pregrasp.hand_pose, chosen, WAYPOINTS), joints, least, touching
 
 
 def _retreat_clearance(

@@ -26,7 +26,7 @@ _HANDS: Final = (
 )
 
 
-class Tables:
+class DeviceSchedule:
     """A schedule on the device, with one rate per dof: the joint rate times `unit` (D,)."""
 
     def __init__(self, schedule: Schedule, unit: Floats) -> None:
@@ -67,7 +67,7 @@ class Data:
             self.depths = kinematics.Depths()
             for kind in _DEPTHS:
                 setattr(self.depths, kind, wp.zeros(capacity, dtype=wp.float32))
-            self.schedule = Tables(still_schedule(), self.unit)
+            self.schedule = DeviceSchedule(zero_schedule(), self.unit)
             self._allocate(capacity, model.bodies, model.dofs, model.options.velocities)
             #: Number of motions that the contact solver stores for its reverse sweep.
             kept = {"direct": 0, "gauss_seidel": model.count}.get(model.options.contact_solver, model.options.passes)
@@ -123,9 +123,9 @@ class Data:
     def set_schedule(self, schedule: Schedule) -> None:
         """Upload a schedule, dilations up to `MAX_DILATION`; launches recorded before keep the former one."""
         with wp.ScopedDevice(self.device):
-            self.schedule = Tables(schedule, self.unit)
+            self.schedule = DeviceSchedule(schedule, self.unit)
 
-    def deepest(self, n: int) -> Floats:
+    def deepest_penetration(self, n: int) -> Floats:
         """Return the deepest penetration (n,) of the first n hands, as last evaluated [m]."""
         return np.max([getattr(self.depths, kind).numpy()[:n] for kind in _DEPTHS], axis=0)
 
@@ -160,7 +160,7 @@ class HandState:
         return HandState(self.pivot[index], self.rotation[index], self.q[index])
 
     @classmethod
-    def joined(cls, states: Sequence[HandState]) -> HandState:
+    def concatenate(cls, states: Sequence[HandState]) -> HandState:
         """Return the hands of several states, one state after the other."""
         return cls(*(np.concatenate([getattr(one, name) for one in states]) for name in ("pivot", "rotation", "q")))
 
@@ -179,7 +179,7 @@ class Schedule:
         return len(self.dilation)
 
 
-def still_schedule() -> Schedule:
+def zero_schedule() -> Schedule:
     """Return a schedule of one iteration for distances and depths only: no dilation, weights or step."""
     zero = np.zeros(1)
     return Schedule(zero, zero, zero, zero, np.zeros((1, 3)))

@@ -15,7 +15,7 @@ from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.topology import face_vectors
-from graspd.worker.simulation.grids import add_grid, faces_of
+from graspd.worker.simulation.grids import add_grid, upload_faces
 from graspd.worker.simulation.kernels import chain as kernels
 from graspd.worker.simulation.kernels import kinematics, nearest, pieces, surface
 
@@ -145,14 +145,14 @@ class DeviceObject:
             skin.alpha = phong_alpha
             skin.field = wp.zeros((0, 0, 0), dtype=wp.float32)
             skin.cells = nearest.Cells()
-            skin.cells.faces = faces_of(obj)
+            skin.cells.faces = upload_faces(obj)
             if cell > 0:
                 add_grid(skin, obj, mesh, cell)
             centred = wp.array(samples - obj.centre_of_mass, dtype=wp.vec3)
             cells = sorted_samples(samples - obj.centre_of_mass)
         return cls(obj, device, skin, mesh, centred, wp.Bvh(centred, centred), cells)
 
-    def thinned(self, count: int) -> DeviceObject:
+    def with_fewer_samples(self, count: int) -> DeviceObject:
         """Return the object with its first `count` samples, which are evenly spread."""
         if count >= len(self.samples):
             return self

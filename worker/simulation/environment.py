@@ -151,21 +151,21 @@ class PlacedGrasps:
         return digest.hexdigest()
 
     @property
-    def everywhere(self) -> Scenes:
+    def all_scenes(self) -> Scenes:
         return Scenes(self.supports, self.object_pose, self.neighbours, self.neighbour_pose)
 
     def centred(self, obj: ObjectModel) -> PlacedGrasps:
         """Return the grasps with the frames of the object `obj` and of all neighbours moved to their centres."""
-        return self.everywhere.centred(obj).placed(self.index)
+        return self.all_scenes.centred(obj).placed(self.index)
 
-    def neighbours_of(self, scene: int) -> Floats:
+    def relative_neighbour_poses(self, scene: int) -> Floats:
         """Return poses (M, 7) of the neighbours in the object frame of a scene."""
         if not self.neighbours:
             return np.zeros((0, 7))
         return np.asarray(compose(invert(self.object_pose[scene]), np.asarray(self.neighbour_pose[scene], float)))
 
     def _neighbour_obstacles(self, scene: int) -> Iterator[Obstacle]:
-        for neighbour, pose in zip(self.neighbours, self.neighbours_of(scene), strict=True):
+        for neighbour, pose in zip(self.neighbours, self.relative_neighbour_poses(scene), strict=True):
             yield from (solid.moved(pose) for solid in neighbour.solids)
 
     def take(self, rows: NDArray[np.intp] | slice) -> PlacedGrasps:
@@ -174,14 +174,14 @@ class PlacedGrasps:
         return taken
 
 
-def join_placed(parts: Sequence[PlacedGrasps]) -> PlacedGrasps:
+def join_placed_grasps(parts: Sequence[PlacedGrasps]) -> PlacedGrasps:
     """Join grasps of several sets, each in its own scenes; supports and neighbours are common."""
     first = parts[0]
     if len(parts) == 1:
         return first
     before = np.cumsum([0, *(len(part.object_pose) for part in parts)])
     index = np.concatenate([part.index + start for part, start in zip(parts, before, strict=False)])
-    whole = join_scenes([part.everywhere for part in parts]).placed(index)
+    whole = join_scenes([part.all_scenes for part in parts]).placed(index)
     vars(whole)["scenes"] = tuple(scene for part in parts for scene in part.scenes)  # not recomputed
     return whole
 

@@ -15,7 +15,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
-from graspd.worker.engines.backend import binary_name
+from graspd.worker.engines.backend import binary_identity
 from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.topology import edge_faces, face_vectors
@@ -42,7 +42,7 @@ def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
     skin.field_error = 0.5 * cell
 
     def fill() -> None:
-        skin.field = _sampled(skin, shape)
+        skin.field = _sample_field(skin, shape)
         grid = (skin.field, skin.field_origin, skin.field_cell)
         skin.cells = list_cells(skin.cells.faces, mesh, *grid, LISTED_M + skin.field_error)
 
@@ -54,8 +54,8 @@ def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
         fill()
         return {"field": skin.field.numpy(), **{name: getattr(skin.cells, name).numpy() for name in _LISTS}}
 
-    terms = (obj.content, repr(cell), repr(float(skin.alpha)), *map(binary_name, (surface, nearest)))
-    fits = partial(_fits, shape=shape, faces=len(obj.faces))
+    terms = (obj.content, repr(cell), repr(float(skin.alpha)), *map(binary_identity, (surface, nearest)))
+    fits = partial(_is_valid_grid, shape=shape, faces=len(obj.faces))
     kept = cached_arrays("object_grids", terms, (sys.modules[__name__],), make, fits=fits)
     skin.field = wp.array(kept["field"], dtype=wp.float32)
     for name, kind in _LISTS.items():
@@ -66,13 +66,13 @@ def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
 _LISTS: Final = {"first": wp.int32, "face": wp.int32, "key": wp.float32}
 
 
-def _sampled(skin: Any, shape: tuple[int, ...]) -> Any:
+def _sample_field(skin: Any, shape: tuple[int, ...]) -> Any:
     field, inputs = wp.empty(shape, dtype=wp.float32), [skin, skin.field_origin, skin.field_cell, 4 * FIELD_REACH]
     wp.launch(surface.sample_field, dim=shape, inputs=inputs, outputs=[field])
     return field
 
 
-def _fits(kept: Arrays, shape: tuple[int, ...], faces: int) -> bool:
+def _is_valid_grid(kept: Arrays, shape: tuple[int, ...], faces: int) -> bool:
     """Check whether arrays fit a grid of this shape over `faces` faces, so that kernels stay in bounds."""
     kinds = {"field": np.float32, "first": np.int32, "face": np.int32, "key": np.float32}
     if set(kept) != set(kinds) or any(kept[name].dtype != kind for name, kind in kinds.items()):
@@ -89,7 +89,7 @@ def _fits(kept: Arrays, shape: tuple[int, ...], faces: int) -> bool:
     )
 
 
-def faces_of(obj: ObjectModel) -> Any:
+def upload_faces(obj: ObjectModel) -> Any:
     """Return the object's faces about its centre of mass, on the current Warp device."""
     corners = (obj.vertices - obj.centre_of_mass)[obj.faces]
     ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -116,15 +116,15 @@ def feature_normals(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats
     out = np.empty((len(faces), nearest.FEATURES, 3))
     out[:, 0] = normal
     edge = edge_faces(faces.astype(np.int64))[0].reshape(3, -1).T.reshape(-1)
-    out[:, 1:4] = _summed(edge, np.repeat(normal, 3, axis=0)).reshape(-1, 3, 3)
+    out[:, 1:4] = _group_sums(edge, np.repeat(normal, 3, axis=0)).reshape(-1, 3, 3)
     side = np.roll(corner, -1, axis=1) - corner
     side /= np.maximum(np.linalg.norm(side, axis=2, keepdims=True), 1e-30)
     angle = np.arccos(np.clip(-(side * np.roll(side, 1, axis=1)).sum(axis=2), -1.0, 1.0))
-    out[:, 4:] = _summed(faces.reshape(-1), (angle[..., None] * normal[:, None]).reshape(-1, 3)).reshape(-1, 3, 3)
+    out[:, 4:] = _group_sums(faces.reshape(-1), (angle[..., None] * normal[:, None]).reshape(-1, 3)).reshape(-1, 3, 3)
     return out
 
 
-def _summed(group: NDArray[np.integer[Any]], rows: Floats) -> Floats:
+def _group_sums(group: NDArray[np.integer[Any]], rows: Floats) -> Floats:
     """Return the sum (R, 3) of each row's group."""
     total = np.zeros((int(group.max(initial=0)) + 1, 3))
     np.add.at(total, group, rows)

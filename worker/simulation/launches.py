@@ -27,17 +27,17 @@ class Launches:
         """Append a launch over `dim`; its arrays live as long as the list."""
         command = wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.device, record_cmd=True)
         self._commands.append((kernel.key.rpartition(".")[2], command))
-        self._calls.append(_packed(command))
+        self._calls.append(_packed_call(command))
         self._arguments.append((inputs, outputs))
         self._graph = None
 
-    def named(self) -> list[tuple[str, Any]]:
+    def named_commands(self) -> list[tuple[str, Any]]:
         return list(self._commands)
 
     def run(self, times: int = 1) -> None:
         """Run all launches `times` times without waiting for the device."""
         if not wp.get_device(self.device).is_cuda:
-            with _counted():
+            with _count_cpu_time():
                 for _ in range(times):
                     for call in self._calls:
                         call()
@@ -59,7 +59,7 @@ class Launches:
 
 def launch(kernel: Any, dim: Any, *, device: Any = None, **given: Any) -> None:
     """Run `warp.launch` and count the CPU time of its kernel while `kernel_seconds` is active."""
-    with nullcontext() if wp.get_device(device).is_cuda else _counted():
+    with nullcontext() if wp.get_device(device).is_cuda else _count_cpu_time():
         wp.launch(kernel, dim, device=device, **given)
 
 
@@ -79,7 +79,7 @@ def kernel_seconds() -> Iterator[list[float]]:
 
 
 @contextmanager
-def _counted() -> Iterator[None]:
+def _count_cpu_time() -> Iterator[None]:
     spent = _spent.get()
     if spent is None:
         yield
@@ -91,17 +91,17 @@ def _counted() -> Iterator[None]:
         spent.append(time.thread_time() - began)
 
 
-def _packed(command: Any) -> Callable[[], object]:
+def _packed_call(command: Any) -> Callable[[], object]:
     """Return a function that runs a recorded launch, on the CPU with arguments that are packed in advance.
     Warp would pack them at each launch under the interpreter's lock, and other threads would wait."""
     if not command.device.is_cpu or command.adjoint or command.block_dim > 1:
         return partial(command.launch)
     bounds, *values = command.params
-    arguments = _arguments_of(tuple(type(value) for value in values))(*values)
+    arguments = _argument_struct(tuple(type(value) for value in values))(*values)
     return partial(command.hooks.forward, ctypes.byref(bounds), ctypes.byref(arguments))
 
 
 @cache
-def _arguments_of(types: tuple[type, ...]) -> type[ctypes.Structure]:
+def _argument_struct(types: tuple[type, ...]) -> type[ctypes.Structure]:
     fields = [(f"argument{k}", kind) for k, kind in enumerate(types)]
     return type("Arguments", (ctypes.Structure,), {"_fields_": fields})

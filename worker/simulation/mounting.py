@@ -92,7 +92,7 @@ def point_clearance(
 ) -> Floats:
     """Return the points' least clearance (N, W) [m] over root poses (N, P, 7), at W wrist positions.
     Scenes are `which` (N,). The mounting's own clearance is at most this, except near edges and corners of solids."""
-    points = points_of(mounting)
+    points = mounting_points(mounting)
     out = np.full((len(poses), len(points)), np.inf)
     for scene in np.unique(which):
         rows = np.flatnonzero(which == scene)
@@ -107,7 +107,7 @@ def point_clearance(
 
 
 @cached_by_content(8)
-def points_of(mounting: HandModel) -> Floats:
+def mounting_points(mounting: HandModel) -> Floats:
     """Return points (W, M, 3) of a mounting at each wrist position, the `OUTERMOST` first, root frame [m]."""
     wrists = wrist_positions(mounting)
     bodies = body_poses(mounting, np.tile(IDENTITY_POSE, (len(wrists), 1)), mounting.expand(wrists))

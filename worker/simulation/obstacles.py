@@ -39,7 +39,7 @@ class PosedFeatures:
     rim: NDArray[np.bool_]  # (F,)
 
     @classmethod
-    def of(cls, hand: HandModel, postures: Posture) -> PosedFeatures:
+    def create(cls, hand: HandModel, postures: Posture) -> PosedFeatures:
         features = hand.features
         bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)[:, features.body]
         centre = quat_rotate(bodies[..., 3:], features.centre) + bodies[..., :3]

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from graspd.service.model.transforms import Floats
-from graspd.worker.simulation.data import Data, HandState, still_schedule
+from graspd.worker.simulation.data import Data, HandState, zero_schedule
 from graspd.worker.simulation.device import to_wxyz, to_xyzw
 from graspd.worker.simulation.kernels import obstacles, solids
 from graspd.worker.simulation.kernels import projection as kernels
@@ -42,7 +42,7 @@ class ProjectionOptions:
     step: float = 3e-3  # largest step in units of the scaled variables [m]
 
 
-def _residuals(capacity: int) -> Any:
+def _allocate_residuals(capacity: int) -> Any:
     out = kernels.Residuals()
     out.count = wp.zeros(capacity, dtype=wp.int32)
     shape = (capacity, CAPACITY)
@@ -63,7 +63,7 @@ class Projection:
         scale = np.repeat(options.scale, [3, 3, model.dofs])
         scale[6:] *= data.unit
         with wp.ScopedDevice(model.device):
-            self.residuals = _residuals(B)
+            self.residuals = _allocate_residuals(B)
             self._row = wp.empty((B * self._lanes, n), dtype=wp.float32)
             self.matrix, self.vector = wp.zeros((B, n, n), dtype=wp.int64), wp.zeros((B, n), dtype=wp.int64)
             self._factor, self._move = wp.empty((B, n, n), dtype=wp.float64), wp.empty((B, n), dtype=wp.float64)
@@ -74,21 +74,21 @@ class Projection:
     def run(self, state: HandState, iterations: int) -> tuple[HandState, Floats]:
         """Run at most `iterations` steps; return each hand's best state, and its deepest penetration (n,) [m]."""
         data, n = self.data, len(state.pivot)
-        data.set_schedule(still_schedule())
+        data.set_schedule(zero_schedule())
         data.set_state(state)
         now, best = self._states(state), self._states(state)
         self._depth.fill_(np.inf)
-        step = self._validated(now, best)
+        step = self._record_depths(now, best)
         self._add_equations(step)
         self._add_step(step, now)
         step.run(iterations)
-        self._validated(now, best).run()
+        self._record_depths(now, best).run()
         pivot, rotation, q = (array.numpy()[:n].copy() for array in (best.pivot, best.rotation, best.q))
         # A hand that no step improved has its rotation as given, in single precision.
         rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
         return HandState(pivot, to_wxyz(rotation), q), self._depth.numpy()[:n].copy()
 
-    def _validated(self, now: Any, best: Any) -> Launches:
+    def _record_depths(self, now: Any, best: Any) -> Launches:
         d, o = self.data, self.options
         out = record_placement(self.model, d, within=max(o.near, o.hold))
         outputs = [d.active, self.residuals.count, best, self._depth]

@@ -137,5 +137,5 @@ def add_step(
     out.add(optimizers.descend, d.capacity, inputs=inputs, outputs=[d.first, d.second, d.hands])
     if patience:
         inputs, outputs = [d.loss, d.depths, patience], [d.best, d.waited, d.active]
-        out.add(optimizers.converge, d.capacity, inputs=inputs, outputs=outputs)
+        out.add(optimizers.stop_converged, d.capacity, inputs=inputs, outputs=outputs)
     out.add(optimizers.advance, 1, inputs=[], outputs=[d.iteration])

@@ -37,7 +37,7 @@ class World:
         return m
 
 
-def row(normal: Floats, point: Floats) -> Floats:
+def jacobian_row(normal: Floats, point: Floats) -> Floats:
     """Return rows (..., 6) that map a motion to the displacement of `point` along `normal`, both (..., 3)."""
     return np.concatenate([normal, np.cross(point, normal)], axis=-1)
 
@@ -52,9 +52,9 @@ def direct(contacts: Contacts, s0: Floats, world: World, passes: int = 60) -> Fl
     """Return motions (..., 6) in compliant contact for free motions (..., 6), by reweighted least squares."""
     n, offset = contacts.normals, world.dilation - contacts.distances
     k = world.stiffness * contacts.weights
-    j = row(n, contacts.points)
+    j = jacobian_row(n, contacts.points)
     across = np.eye(3) - n[:, :, None] * n[:, None, :]
-    jt = row(across, contacts.points[:, None, :])
+    jt = jacobian_row(across, contacts.points[:, None, :])
     pushes, slides = j[:, :, None] * j[:, None, :], np.einsum("nei,nej->nij", jt, jt)
     s = s0
     for _ in range(passes):
@@ -95,7 +95,7 @@ def jacobi(contacts: Contacts, s0: Floats, world: World, passes: int) -> Floats:
 
 def _push_out(p: Floats, n: Floats, rho: Floats, s: Floats, world: World) -> tuple[Floats, Floats]:
     """Return normal impulses (...) that end penetration at points (..., 3), and the motions they cause."""
-    j = row(n, p)
+    j = jacobian_row(n, p)
     back = j @ np.linalg.inv(world.mass)
     impulse = np.maximum(world.dilation - rho + np.sum(j * s, axis=-1), 0.0) / np.sum(j * back, axis=-1)
     return impulse, -impulse[..., None] * back
@@ -106,7 +106,7 @@ def _apply_friction(p: Floats, n: Floats, impulse: Floats, s: Floats, world: Wor
     u = s[..., :3] + np.cross(s[..., 3:], p)
     tangent = u - np.sum(n * u, axis=-1, keepdims=True) * n
     length = np.linalg.norm(tangent, axis=-1)
-    jt = row(tangent / np.maximum(length, 1e-9)[..., None], p)
+    jt = jacobian_row(tangent / np.maximum(length, 1e-9)[..., None], p)
     back = jt @ np.linalg.inv(world.mass)
     weight = np.sum(jt * back, axis=-1)
     slip = np.where(length > 1e-9, np.minimum(length / np.maximum(weight, 1e-9), world.friction * impulse), 0.0)

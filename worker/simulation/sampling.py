@@ -24,10 +24,10 @@ def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
     """Return evenly spread points (count, 3) of the surface, its sharp edges included [m]; deterministic."""
     code = (sys.modules[__name__], mesh_geometry, surface, topology)
     terms = (obj.content, count, seed)
-    return cached_arrays("object_samples", terms, code, lambda: {"points": _sampled(obj, count, seed)})["points"]
+    return cached_arrays("object_samples", terms, code, lambda: {"points": _sample_surface(obj, count, seed)})["points"]
 
 
-def _sampled(obj: ObjectModel, count: int, seed: int) -> Floats:
+def _sample_surface(obj: ObjectModel, count: int, seed: int) -> Floats:
     rng = np.random.default_rng(seed)
     candidates = (CANDIDATES if count <= MANY else FEWER_CANDIDATES) * count
     cross = face_vectors(obj.vertices, obj.faces)

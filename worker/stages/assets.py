@@ -62,7 +62,7 @@ def hand_of(store: Store, message: TaskMessage) -> HandModel:
 def object_of(store: Store, message: TaskMessage) -> ObjectModel:
     """Load the object of a task, simplified within the tolerance of its fidelity."""
     request, digest = message.request, message.object_digest
-    name, error = request.object, request.knobs.face_error_m
+    name, error = request.object, request.resolved_fidelity.face_error_m
     regions = (request.touch_region, request.avoid_region)
     terms = (error, regions, request.validation == "dexgraspbench", *request.object_properties.items())
 
@@ -87,10 +87,10 @@ def neighbours_of(store: Store, message: TaskMessage) -> list[ObjectModel]:
         obj = prepared_object(store, digest, name=name, face_error_m=NEIGHBOUR_FACE_ERROR_M)
         publish_model(store, AssetKind.OBJECT, obj)
         with suppress(MeshError):  # without pieces, the object's hull is the obstacle
-            pieces_of(store, obj)
+            load_pieces(store, obj)
         return obj
 
-    beside = [(one.object, one.digest or "") for one in message.request.beside]
+    beside = [(one.object, one.digest or "") for one in message.request.all_neighbours]
     return [_cached((store.url, "neighbour", *key), partial(load, *key)) for key in beside]
 
 
@@ -109,7 +109,7 @@ def cache_network(store: Store, message: TaskMessage) -> None:
 
 def neighbour_attributes(message: TaskMessage) -> dict[str, Attribute]:
     """Return a shard's attributes for the neighbours of its object; empty if there are none."""
-    beside = message.request.beside
+    beside = message.request.all_neighbours
     if not beside:
         return {}
     return {"neighbours": [one.object for one in beside], "neighbour_digests": [one.digest or "" for one in beside]}
@@ -149,21 +149,21 @@ def _load(store: Store, digest: str, *, name: str, face_error_m: float) -> Objec
 _pieces_lock = threading.Lock()
 
 
-def pieces_of(store: Store, obj: ObjectModel) -> ConvexPieces:
+def load_pieces(store: Store, obj: ObjectModel) -> ConvexPieces:
     """Return an object's pieces from this machine's cache or the store, else compute and store them.
     Raises MeshError: the object has no usable pieces. StoreUnavailable."""
     file = piece_file(obj)
     key = names.object_pieces_key(obj.digest, file.stem)
     with _pieces_lock:  # tasks of one object start at once: one of them makes the pieces
         if not file.is_file():
-            _fetch(store, key, file)
+            _fetch_pieces(store, key, file)
         pieces = decompose(obj)
         if file.is_file() and not store.exists(key):
             put_sealed(store, key, file.read_bytes())
         return pieces
 
 
-def _fetch(store: Store, key: str, file: Path) -> None:
+def _fetch_pieces(store: Store, key: str, file: Path) -> None:
     try:
         data = get_sealed(store, key)
     except (NotFoundError, DamagedError):

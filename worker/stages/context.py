@@ -19,7 +19,7 @@ from graspd.service.model.messages import TaskMessage
 from graspd.service.model.names import SHARD_KINDS
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.store.columns import Attribute
-from graspd.service.store.manifests import ShardManifest, manifest_of
+from graspd.service.store.manifests import ShardManifest, create_manifest
 from graspd.service.store.shards import check_columns, json_attribute, write_shard
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 
@@ -87,7 +87,7 @@ class Output:
     info: Mapping[str, Any] = field(default_factory=dict)
 
 
-def shard_of(
+def build_shard(
     message: TaskMessage, output: Output, *, device: str, seconds: float, worker: str, lost: ShardManifest | None = None
 ) -> tuple[ShardManifest, bytes]:
     """Build a stage's manifest and HDF5 bytes. Raises InputError: the columns do not fit the schema.
@@ -100,7 +100,7 @@ def shard_of(
         "object": request.object,
         "object_digest": message.object_digest,
         "method": request.method,
-        "fidelity": json_attribute(request.knobs.model_dump(mode="json")),
+        "fidelity": json_attribute(request.resolved_fidelity.model_dump(mode="json")),
         "seed": request.seed,
         "batch": message.batch,
         "device": device,
@@ -114,7 +114,7 @@ def shard_of(
     columns = output.arrays
     counts = check_columns(kind, columns)  # type: ignore[arg-type]
     data = write_shard(kind, columns, attributes)  # type: ignore[arg-type]
-    manifest = manifest_of(
+    manifest = create_manifest(
         message, data, columns, attributes, counts, device=device, seconds=seconds, worker=worker, info=output.info
     )
     return manifest, data

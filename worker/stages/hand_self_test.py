@@ -24,12 +24,12 @@ from graspd.worker.grasps import Posture, join_grasp_sets
 from graspd.worker.hands.jaws import fingertip_pad, jaws_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.pinch_postures import oppositions_of
+from graspd.worker.hands.pinch_postures import pinch_postures_of
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object
 from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.payload import Limit, limit_of
+from graspd.worker.validation.payload import PayloadLimit, payload_limit
 from graspd.worker.validation.protocol import Outcome
 
 #: Total number of free grasps, and the share that must hold for the verdict ready.
@@ -72,7 +72,7 @@ class SelfTest:
     best: BestGrasp | None = None  # None if no grasp held
     lost: float = 0.0  # share of failed grasps that lost the object during closing; the others fail under the pushes
     give_m: float = math.inf  # fingertip motion [m] within which the stiffest servo goes from zero to its limit
-    limit: Limit | None = None  # payload on a table at full actuator force; None if no grasp lifts
+    limit: PayloadLimit | None = None  # payload on a table at full actuator force; None if no grasp lifts
 
     @property
     def line(self) -> str:
@@ -129,17 +129,17 @@ def self_test(
     width = fitting_width(hand)
     held: dict[str, list[bool]] = {}
     lost: list[bool] = []
-    lifted: list[tuple[int, float, Limit | None]] = []
+    lifted: list[tuple[int, float, PayloadLimit | None]] = []
     best: BestGrasp | None = None
     objects = plain_objects(width)
     for number, (name, obj) in enumerate(objects.items()):
-        part = run.part(number / len(objects), (number + 1) / len(objects))
+        part = run.with_progress_range(number / len(objects), (number + 1) / len(objects))
         free, standing = (count // 3 + (number < count % 3) for count in (grasps, on_table))
-        found = _batches(hand, obj, free, part.part(0.0, 0.7))
-        lifted += [_test_lifts(hand, obj, standing, part.part(0.7, 1.0))]
+        found = _plan_batches(hand, obj, free, part.with_progress_range(0.0, 0.7))
+        lifted += [_test_lifts(hand, obj, standing, part.with_progress_range(0.7, 1.0))]
         held[name] = [bool(value == 1) for batch in found for value in batch.columns["quality/success"]]
         lost += [bool(one) for batch in found for one in _lost_in_closing(batch)]
-        better = [_best(obj, batch) for batch in found]
+        better = [_best_grasp(obj, batch) for batch in found]
         best = max((one for one in (best, *better) if one), key=lambda one: one.rank, default=None)
     every = [value for values in held.values() for value in values]
     by_object = {name: float(np.mean(values)) for name, values in held.items() if values}
@@ -152,7 +152,7 @@ def self_test(
     )
 
 
-def _join_limits(limits: list[Limit]) -> Limit | None:
+def _join_limits(limits: list[PayloadLimit]) -> PayloadLimit | None:
     if not limits:
         return None
     lifts, bound = (max(getattr(one, name) for one in limits) for name in ("lifts_kg", "bound_kg"))
@@ -179,7 +179,7 @@ def _drive_deflection(hand: HandModel) -> float:
     return float(np.min((hand.effort / hand.stiffness * lever)[closes], initial=math.inf))
 
 
-def _batches(hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext) -> list[ValidatedBatch]:
+def _plan_batches(hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext) -> list[ValidatedBatch]:
     sizes = [min(BATCH_SIZE, count - first) for first in range(0, count, BATCH_SIZE)]
     return [validated_grasps(hand, obj, _request(n), count=n, batch=batch, run=run) for batch, n in enumerate(sizes)]
 
@@ -190,7 +190,7 @@ def _request(count: int) -> JobOptions:
 
 def _test_lifts(
     hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext
-) -> tuple[int, float, Limit | None]:
+) -> tuple[int, float, PayloadLimit | None]:
     """Test grasps of an object on a table.
     Return the number of planned grasps, the share that lifts, and the payload at full actuator force."""
     scenes, _ = scenes_of(TABLE, obj, count=TABLE_SCENES, seed=0)
@@ -200,11 +200,11 @@ def _test_lifts(
     both = join_grasp_sets([grasps, strong])
     assert both.scene is not None
     placed, pieces = scenes.centred(obj).placed(both.scene), decompose(about)
-    limit = limit_of(hand, about, both, pieces=pieces, placed=placed, least=1, run=run.without_progress())
+    limit = payload_limit(hand, about, both, pieces=pieces, placed=placed, least=1, run=run.without_progress())
     return found.planned, found.shares["lift_share"], limit and replace(limit, grasps=count)
 
 
-def _best(obj: ObjectModel, found: ValidatedBatch) -> BestGrasp | None:
+def _best_grasp(obj: ObjectModel, found: ValidatedBatch) -> BestGrasp | None:
     columns = found.columns
     rows = np.flatnonzero(columns["quality/success"] == 1)
     if not len(rows):
@@ -220,14 +220,14 @@ def fitting_width(hand: HandModel) -> float:
     if (jaws := jaws_of(hand)) is not None:
         return float(np.clip(OF_OPENING * jaws.opening, *WIDTH_M))
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
-    tips = np.array([_tip(hand, body, poses[body]) for body in hand.fingertips or (hand.bodies - 1,)])
+    tips = np.array([_finger_end(hand, body, poses[body]) for body in hand.fingertips or (hand.bodies - 1,)])
     reach = float(np.median(np.linalg.norm(tips - hand.palm.centre, axis=1)))
     # Objects thinner than the least gap between opposed pads do not suit a hand.
-    least = float(known.width[0]) if len(known := oppositions_of(hand)) else 0.0
+    least = float(known.width[0]) if len(known := pinch_postures_of(hand)) else 0.0
     return float(np.clip(max(OF_REACH * reach, least), *WIDTH_M))
 
 
-def _tip(hand: HandModel, body: int, pose: Floats) -> Floats:
+def _finger_end(hand: HandModel, body: int, pose: Floats) -> Floats:
     """Return a finger's end [m]: its last joint, or its pad if only one joint closes it."""
     closing, at = 0, body
     while at > 0:

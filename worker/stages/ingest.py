@@ -41,7 +41,7 @@ _MODEL_CPU_S: Final = 8.0  # CPU time of a check [s] above which the first task 
 
 def run(message: IngestMessage, context: TaskContext) -> None:
     """Check the asset and write `check.json`, also for a refusal."""
-    files = _files(message, context)
+    files = _load_files(message, context)
     found, model = check_in_child(message.kind, message.name, files, context)
     if found["verdict"] != "refuse" and load_asset(context.store, message.kind, message.digest).self_test:
         from graspd.worker.hands.load import load_hand
@@ -55,7 +55,7 @@ def run(message: IngestMessage, context: TaskContext) -> None:
     put_document(context.store, names.asset_check_key(message.kind, message.digest), found)
 
 
-def _files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:
+def _load_files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:
     if message.kind is AssetKind.HAND:
         from graspd.worker.stages.assets import load_hand_files
 
@@ -90,7 +90,7 @@ def check_in_child(
         complaint = errors.read_bytes()[-4000:].decode(errors="replace")
         if target.is_file() and target.stat().st_size > _FINDING_BYTES:
             why = f"the result of the check exceeds {_FINDING_BYTES >> 20} MiB; simplify it, or shorten its names"
-            return _refused(kind, name, why), b""
+            return _refusal_record(kind, name, why), b""
         if target.is_file():
             # A complete result counts even if the model after it failed. A truncated result does not parse.
             with contextlib.suppress(ValueError):
@@ -101,7 +101,7 @@ def check_in_child(
             raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} to check {name}")
         if code == -signal.SIGKILL:
             raise OSError(f"the check of {name} was killed; the machine may lack memory")
-        return _refusal(kind, name, code, complaint, memory_bytes, cpu_s), b""
+        return _explain_crash(kind, name, code, complaint, memory_bytes, cpu_s), b""
 
 
 def _environment() -> dict[str, str]:
@@ -122,7 +122,9 @@ def _wait(child: subprocess.Popen[bytes], context: TaskContext) -> int:
             child.wait()
 
 
-def _refusal(kind: AssetKind, name: str, code: int, complaint: str, memory_bytes: int, cpu_s: int) -> dict[str, Any]:
+def _explain_crash(
+    kind: AssetKind, name: str, code: int, complaint: str, memory_bytes: int, cpu_s: int
+) -> dict[str, Any]:
     if code == -signal.SIGXCPU:
         why = f"reading it takes longer than {cpu_s} s of computing; simplify it"
     elif any(sign in complaint for sign in _OUT_OF_MEMORY):
@@ -130,14 +132,14 @@ def _refusal(kind: AssetKind, name: str, code: int, complaint: str, memory_bytes
     else:
         last = complaint.strip().splitlines()[-1:] or [f"exit code {code}"]
         why = f"reading it crashed the checker ({last[0][:200]}); repair or re-export the file"
-    return _refused(kind, name, why)
+    return _refusal_record(kind, name, why)
 
 
-def _refused(kind: AssetKind, name: str, why: str) -> dict[str, Any]:
+def _refusal_record(kind: AssetKind, name: str, why: str) -> dict[str, Any]:
     return {"verdict": "refuse", "message": f"{name}: {why}", "repairs": [], "facts": {"kind": kind.value}}
 
 
-def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cpu_s: str) -> None:
+def _check_upload(kind: str, name: str, source: str, target: str, memory_bytes: str, cpu_s: str) -> None:
     # The hard limit stays, since its signal equals that of a machine out of memory. Children have their own limits.
     resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s), resource.getrlimit(resource.RLIMIT_CPU)[1]))
     limits = {resource.RLIMIT_AS: int(memory_bytes), resource.RLIMIT_CORE: 0, resource.RLIMIT_FSIZE: _MODEL_BYTES}
@@ -157,14 +159,14 @@ def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cp
         found = check_object(files, name)
     Path(target).write_text(json.dumps(found))
     if found["verdict"] != "refuse" and kind != AssetKind.NETWORK and time.process_time() < _MODEL_CPU_S:
-        from graspd.worker.stages.models import model_of
+        from graspd.worker.stages.models import model_glb
 
         # The result is kept even if its model cannot be made.
         with contextlib.suppress(Exception):
-            model = model_of(AssetKind(kind), name, files)
+            model = model_glb(AssetKind(kind), name, files)
             if len(model) <= _MODEL_BYTES:
                 Path(target).with_name(_MODEL).write_bytes(model)
 
 
 if __name__ == "__main__":
-    _child(*sys.argv[1:])
+    _check_upload(*sys.argv[1:])

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from graspd.service.model import names
-from graspd.service.model.colours import Colour, linear
+from graspd.service.model.colours import Colour, linear_rgb
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats
@@ -37,7 +37,7 @@ SHOWN_ERROR_M: Final = Fidelity().face_error_m  # tolerance of a displayed objec
 _BUILTIN: Final = Path(__file__).parents[2] / "service" / "builtin" / "models"
 
 
-def model_of(kind: AssetKind, name: str, files: dict[str, bytes]) -> bytes:
+def model_glb(kind: AssetKind, name: str, files: dict[str, bytes]) -> bytes:
     """Return the hand or object in `files` as binary glTF; raises the errors of loading it."""
     if kind is AssetKind.HAND:
         return hand_glb(load_hand(files, name=name, digest=""))
@@ -56,7 +56,7 @@ def write_builtins() -> None:
     _BUILTIN.mkdir(exist_ok=True)
     for kind in AssetKind:
         for name in builtin_names(kind):
-            (_BUILTIN / f"{kind.value}-{name}.glb").write_bytes(model_of(kind, name, builtin_files(kind, name)))
+            (_BUILTIN / f"{kind.value}-{name}.glb").write_bytes(model_glb(kind, name, builtin_files(kind, name)))
 
 
 SURFACE_POINTS: Final = 3000  # hand points from which a viewer measures the distance to the object
@@ -93,7 +93,7 @@ def hand_glb(hand: HandModel) -> bytes:
         nodes.append(node)
     preshape = dict(zip(hand.joint_names, rounded_values(hand.expand(hand.preshape)), strict=True))
     palm = {"centre": rounded_values(hand.palm.centre), "approach": rounded_values(hand.palm.approach)}
-    extras = {"kind": "hand", "name": hand.name, "preshape": preshape, "palm": palm, **_found(hand)}
+    extras = {"kind": "hand", "name": hand.name, "preshape": preshape, "palm": palm, **_document_facts(hand)}
     return document.to_bytes(nodes, extras)
 
 
@@ -106,7 +106,7 @@ def object_glb(obj: ObjectModel) -> bytes:
     return document.to_bytes([node], extras)
 
 
-def _found(hand: HandModel) -> dict[str, Any]:
+def _document_facts(hand: HandModel) -> dict[str, Any]:
     drives = {}
     for body, joint in zip(hand.joint_body.tolist(), hand.joint_names, strict=True):
         times, plus = float(hand.multiplier[body]), float(hand.offset[body])
@@ -120,7 +120,7 @@ def _found(hand: HandModel) -> dict[str, Any]:
 
 
 def _piece_primitive(document: Document, hand: HandModel, body: int) -> dict[str, Any] | None:
-    return _joined(document, [(p.vertices, p.faces, None) for p in hand.pieces if p.body == body])
+    return _join_meshes(document, [(p.vertices, p.faces, None) for p in hand.pieces if p.body == body])
 
 
 def _body_primitives(
@@ -130,17 +130,19 @@ def _body_primitives(
     meshes: list[tuple[Floats, Ints, Colour | None]] = [
         (mesh.vertices, mesh.faces, mesh.colour) for mesh in visuals if mesh.body == body
     ]
-    primitive = _joined(document, meshes) if meshes else _piece_primitive(document, hand, body)
+    primitive = _join_meshes(document, meshes) if meshes else _piece_primitive(document, hand, body)
     return [primitive] if primitive else []
 
 
-def _joined(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]) -> dict[str, Any] | None:
+def _join_meshes(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]) -> dict[str, Any] | None:
     if not meshes:
         return None
     starts = np.cumsum([0, *(len(vertices) for vertices, _, _ in meshes)])
     colours = None
     if any(colour for _, _, colour in meshes):
-        colours = np.concatenate([np.tile(linear(*(colour or _GREY)), (len(faces), 1)) for _, faces, colour in meshes])
+        colours = np.concatenate(
+            [np.tile(linear_rgb(*(colour or _GREY)), (len(faces), 1)) for _, faces, colour in meshes]
+        )
     return document.add_triangles(
         np.concatenate([vertices for vertices, _, _ in meshes]),
         np.concatenate([faces + start for (_, faces, _), start in zip(meshes, starts, strict=False)]),

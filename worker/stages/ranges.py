@@ -46,7 +46,7 @@ def join_outputs(message: TaskMessage, made: Sequence[Output], *, base_rows: Seq
     schema, parts = SCHEMAS[kind], [output.arrays for output in made]  # type: ignore[index]
     firsts = {"grasp/base_index": [rows.start for rows in base_rows]}
     if "scene/object_pose" in parts[0]:
-        firsts["grasp/scene_index"] = _starts([len(part["scene/object_pose"]) for part in parts])
+        firsts["grasp/scene_index"] = _start_offsets([len(part["scene/object_pose"]) for part in parts])
     columns: dict[str, NDArray[Any]] = {}
     for path in dict.fromkeys(path for part in parts for path in part):
         if schema[path].shape.split()[0] not in _ROWS:
@@ -61,7 +61,7 @@ def join_outputs(message: TaskMessage, made: Sequence[Output], *, base_rows: Seq
     attributes = {**made[0].attributes}
     if kind == "base":
         attributes["batch_rows"] = json_attribute([len(part["grasp/hand_pose"]) for part in parts])
-    return Output(columns, attributes, _summed([output.info for output in made]))
+    return Output(columns, attributes, _combine_records([output.info for output in made]))
 
 
 def base_rows(base: Shard, message: TaskMessage) -> list[range]:
@@ -70,10 +70,10 @@ def base_rows(base: Shard, message: TaskMessage) -> list[range]:
     counts = [len(base.arrays["grasp/hand_pose"])] if stored is None else json.loads(str(stored))
     if len(counts) != len(sizes_of(message)):
         raise DamagedShard(f"shard {message.inputs[0]} has {len(counts)} batches, not {len(sizes_of(message))}")
-    return [range(start, start + count) for start, count in zip(_starts(counts), counts, strict=True)]
+    return [range(start, start + count) for start, count in zip(_start_offsets(counts), counts, strict=True)]
 
 
-def _summed(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _combine_records(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Combine the records of several batches.
     Counts and seconds are summed, shares averaged with the planned grasps as weights; others are the first batch's."""
     found = dict(records[0])
@@ -90,5 +90,5 @@ def _summed(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def _starts(counts: Sequence[int]) -> list[int]:
+def _start_offsets(counts: Sequence[int]) -> list[int]:
     return list(accumulate(counts, initial=0))[:-1]

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.scene_spec import supports_in
+from graspd.service.model.scene_spec import scene_supports
 from graspd.service.model.states import Stage
 from graspd.service.model.transforms import compose
-from graspd.service.readers.trajectories import wrists_of
+from graspd.service.readers.trajectories import wrist_angles
 from graspd.service.store import validity
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import Shard, json_attribute
@@ -34,8 +34,8 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         others = neighbours_of(context.store, message)
         beside = Neighbours(others, np.asarray(shard["scene/neighbour_pose"], float)) if others else None
         drawn = _select_drawn_hand(shard, message, context)
-        extras = replace(extras, supports=supports_in(request.place), drawn=drawn, neighbours=beside)
-        attributes = {"base_shard": message.inputs[0], "scene": json_attribute(request.place.to_attribute())}
+        extras = replace(extras, supports=scene_supports(request.scene_spec), drawn=drawn, neighbours=beside)
+        attributes = {"base_shard": message.inputs[0], "scene": json_attribute(request.scene_spec.to_attribute())}
         attributes |= neighbour_attributes(message)
     context.check()
     pictures = render(
@@ -46,7 +46,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         width=request.width,
         height=request.height,
         seed=batch_seed(message),
-        run=context.run.part(0.0, 1.0),
+        run=context.run.with_progress_range(0.0, 1.0),
         extras=extras,
     )
     return Output(pictures, attributes)
@@ -61,4 +61,4 @@ def _select_drawn_hand(base: Shard, message: TaskMessage, context: TaskContext) 
         return None
     poses = np.asarray(base["scene/object_pose"], float)
     hand_poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
-    return DrawnHand(hand, rows, compose(poses, hand_poses), joints, wrists_of(base, rows))
+    return DrawnHand(hand, rows, compose(poses, hand_poses), joints, wrist_angles(base, rows))

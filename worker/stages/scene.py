@@ -35,16 +35,16 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     """Make the scenes of each batch."""
     parts = split_into_batches(message)
 
-    def reported(number: int) -> TaskContext:
+    def report_scene(number: int) -> TaskContext:
         context.check()
         context.progress(number, len(parts), "scenes")
         return context
 
     if message.request.in_scene:
-        return join_outputs(message, [_make_scenes(part, reported(number)) for number, part in enumerate(parts)])
+        return join_outputs(message, [_make_scenes(part, report_scene(number)) for number, part in enumerate(parts)])
     base = load_input(message, context, Stage.SYNTHESIZE)
     rows = base_rows(base, message)
-    made = [_transfer_to_scenes(part, reported(number), base, rows[number]) for number, part in enumerate(parts)]
+    made = [_transfer_to_scenes(part, report_scene(number), base, rows[number]) for number, part in enumerate(parts)]
     return join_outputs(message, made, base_rows=rows)
 
 
@@ -52,7 +52,7 @@ def _make_scenes(message: TaskMessage, context: TaskContext) -> Output:
     """Place the object and its neighbours in `request.scenes` scenes.
     Raises SceneError: they do not fit, penetrate each other, or do not come to rest."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
-    place = message.request.place
+    place = message.request.scene_spec
     # The first batch has the same scenes as `graspd synth` with the same seed.
     seed = batch_seed(message) if message.batch else message.request.seed
     others = neighbours_of(context.store, message)

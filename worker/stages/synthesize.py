@@ -38,7 +38,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     hand, obj = assets.hand_of(context.store, message), assets.object_of(context.store, message)
     assets.cache_network(context.store, message)
     columns = _scene_columns(message, context)
-    scenes = [_scenes(message, part, context) for part in columns]
+    scenes = [_build_scenes(message, part, context) for part in columns]
     context.check()
     try:
         found = validated_batches(
@@ -49,7 +49,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             first=message.batch,
             join=context.join,
             scenes=scenes or None,
-            pieces=lambda prepared: assets.pieces_of(context.store, prepared),
+            pieces=lambda prepared: assets.load_pieces(context.store, prepared),
             run=context.run,
             checked=partial(_stop_if_empty, message, in_scenes=bool(scenes)),
             empty_on=(NoStartFound,) if scenes else (),
@@ -59,7 +59,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         if scenes and type(error) in (InputError, NoStartFound):
             raise SceneError(str(error)) from None
         raise
-    made = [_output(one, part) for one, part in zip(found, columns or [{}] * len(found), strict=True)]
+    made = [_create_output(one, part) for one, part in zip(found, columns or [{}] * len(found), strict=True)]
     attributes = base_attributes(
         hand,
         obj,
@@ -74,7 +74,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     return replace(whole, attributes={**whole.attributes, **attributes, **of_scenes})
 
 
-def _output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Output:
+def _create_output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Output:
     info: dict[str, Any] = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
     info |= {name: round(value, 4) for name, value in found.shares.items()}
     info |= {"rejected": found.rejected, "outcomes": found.outcomes, "planned": found.planned}
@@ -97,8 +97,8 @@ def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str,
     return [{name: column[number] for name, column in parts.items()} for number in range(count)]
 
 
-def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: TaskContext) -> Scenes:
-    scenes = Scenes(supports_of(message.request.place), columns["scene/object_pose"])
+def _build_scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: TaskContext) -> Scenes:
+    scenes = Scenes(supports_of(message.request.scene_spec), columns["scene/object_pose"])
     if not (others := assets.neighbours_of(context.store, message)):
         return scenes
     beside = tuple(neighbour_of(other) for other in others)
@@ -110,13 +110,13 @@ def _stop_if_empty(message: TaskMessage, batch: int, found: ValidatedBatch, *, i
     request, limit = message.request, found.limit
     if batch or request.want == "candidates" or len(found.grasps):
         return
-    none = f"none of {found.planned} candidates is {request.counted}"
+    none = f"none of {found.planned} candidates is {request.counted_status}"
     if limit is not None and limit.is_far_exceeded:
         raise LoadError(f"{none}: {limit.line}")
     if in_scenes:
         reasons = [format_outcomes(found.outcomes), found.narrow, limit.line if limit is not None else ""]
         lost = "; ".join(filter(None, reasons))
         raise SceneError(
-            f"{none} in its scene ({request.place.kind}): {lost}; give "
+            f"{none} in its scene ({request.scene_spec.kind}): {lost}; give "
             f"a larger budget than {request.budget:g} candidates for each grasp, or another pose, scene, hand or seed"
         )

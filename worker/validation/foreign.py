@@ -74,11 +74,11 @@ def foreign_verdicts(
     """Validate grasps of `same.ours` in the other model, with the settings of their nominal verdicts."""
     level = cast(Level, nominal.level)
     moved = transfer_grasps(same, grasps)
-    found = validate(with_drives_of(same), obj, moved, level=level, hard=nominal.hard, pieces=pieces, run=run)
+    found = validate(transfer_drives(same), obj, moved, level=level, hard=nominal.hard, pieces=pieces, run=run)
     return ForeignVerdicts(nominal, found, same)
 
 
-def with_drives_of(same: HandMatch) -> HandModel:
+def transfer_drives(same: HandMatch) -> HandModel:
     """Return the other model with the gains and limits of `same.ours`.
     Joint i of the n joints of a dof with gain k and limit e, moved by m_i, gets the gain k / (n m_i^2) and the limit e
     / (n |m_i|). Conversely, a dof has gain sum(m_i^2 k_i) and limit sum(|m_i| e_i). Coupled joints and tendons thus
@@ -99,10 +99,12 @@ def transfer_grasps(same: HandMatch, grasps: GraspSet) -> GraspSet:
     """Return the grasps as postures of the other model: base transformed, joints matched by name.
     Joints that only the other model couples take the nearest feasible values."""
 
-    def posture(part: Posture) -> Posture:
+    def transfer_posture(part: Posture) -> Posture:
         pose, joints = compose(part.hand_pose, same.base), part.joint_positions[:, same.joints]
         free = same.theirs.dofs == len(same.theirs.joint_names)
         return Posture(pose, joints if free else nearest_feasible_joints(same.theirs, joints))
 
     loss = np.asarray(grasps.stability_loss, float)
-    return GraspSet(posture(grasps.grasp), posture(grasps.pregrasp), posture(grasps.squeeze), loss)
+    return GraspSet(
+        transfer_posture(grasps.grasp), transfer_posture(grasps.pregrasp), transfer_posture(grasps.squeeze), loss
+    )

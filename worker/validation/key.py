@@ -83,7 +83,7 @@ def verdict_key(
             "object": [obj.digest, np.round(obj.inertia, 12).tolist(), np.round(obj.centre_of_mass, 9).tolist()],
             "pieces": pieces.digest,
             "physics": asdict(model.MujocoOptions().hardened() if hard else model.MujocoOptions()),
-            "constants": [_values(MOVES), _values(LEVEL_MOVES[level])],
+            "constants": [_named_constants(MOVES), _named_constants(LEVEL_MOVES[level])],
             # Only for grippers, so that the keys of other hands stay unchanged.
             **({"several_contacts": flag} if (flag := model.multi_contact_flags(hand)) else {}),
             # Only for hands with tendons, for the same reason.
@@ -101,7 +101,7 @@ def postures_key(terms: str, grasps: GraspSet) -> str:
     return digest_json([terms, digest_bytes(b"".join(np.ascontiguousarray(a, float).tobytes() for a in arrays))])
 
 
-def _values(names: dict[ModuleType, tuple[str, ...]]) -> dict[str, Any]:
+def _named_constants(names: dict[ModuleType, tuple[str, ...]]) -> dict[str, Any]:
     """Return named constants by the last part of their module's name; those of `opening` under `postures`."""
     out: dict[str, Any] = {}
     for part, there in names.items():

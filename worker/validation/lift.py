@@ -22,7 +22,7 @@ from graspd.service.model.transforms import Floats, invert, quat_conjugate, quat
 from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.simulation.environment import RISE_M, PlacedGrasps
-from graspd.worker.validation.model import Scene, blend
+from graspd.worker.validation.model import Scene, interpolate_postures
 from graspd.worker.validation.protocol import MAX_PENETRATION_M, MAX_ROTATION, STAGE_S, STAGES, Outcome, Rollout, Test
 
 #: Largest displacement [m] and tilt [rad] of a neighbour; rotation about the vertical is allowed.
@@ -54,7 +54,7 @@ class LiftOutcome(IntEnum):
 
 
 @dataclass
-class LiftTest:
+class LiftResult:
     outcome: LiftOutcome = LiftOutcome.NOT_TRIED
     margin: float = 0.0
     """Larger ratio of final deviation in position or rotation to its limit; 0 if the hand did not rise."""
@@ -73,23 +73,23 @@ class Lift(Test):
         self.placed = placed
         self._goal = np.zeros(3)
         self._in_hand = True
-        self._beside = placed.neighbours_of(0)
+        self._beside = placed.relative_neighbour_poses(0)
 
-    def dexgraspbench(self, grasps: GraspSet, row: int) -> LiftTest:  # type: ignore[override]
+    def dexgraspbench(self, grasps: GraspSet, row: int) -> LiftResult:  # type: ignore[override]
         """Run the published test: one check of the object's world pose, after the rise."""
         self._in_hand = False
-        if (rollout := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
+        if (rollout := self._set_up_scene(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
             return rollout
         self._close(grasps, row)
         self._rise(grasps, row, np.arange(1, STAGES + 1) / STAGES, STAGE_S)
-        return self._result(rollout, self._validate(Rollout()))
+        return self._complete_result(rollout, self._validate(Rollout()))
 
-    def lift(self, grasps: GraspSet, row: int) -> LiftTest:
+    def lift(self, grasps: GraspSet, row: int) -> LiftResult:
         """Run the test from the standoff to the end of the hold, along `grasps.approach`."""
         self._in_hand = True
-        if (rollout := self._begin(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
+        if (rollout := self._set_up_scene(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
             return rollout
-        if self._touches(grasps, row):
+        if self._collides_on_approach(grasps, row):
             rollout.outcome = LiftOutcome.TOUCHED_ON_THE_WAY
             return rollout
         if not self._close(grasps, row, give_up=True):
@@ -99,27 +99,27 @@ class Lift(Test):
         self._rise(grasps, row)
         if (outcome := self._validate(Rollout())) is Outcome.HELD:
             outcome = self._hold(Rollout())
-        rollout = self._result(rollout, outcome)
+        rollout = self._complete_result(rollout, outcome)
         if rollout.success and self._neighbours_moved():
             rollout.outcome = LiftOutcome.NEIGHBOUR_MOVED
         return rollout
 
-    def _begin(self, grasps: GraspSet, row: int) -> LiftTest:
+    def _set_up_scene(self, grasps: GraspSet, row: int) -> LiftResult:
         """Set up the grasp's scene with all objects at rest; gravity acts on objects but not on the hand."""
         self._steps, number = 0, int(self.placed.index[row])
         self._scene_pose = invert(np.asarray(self.placed.object_pose[number], float))
         self._up = self.placed.scenes[number].up
-        self._beside = self.placed.neighbours_of(number)
+        self._beside = self.placed.relative_neighbour_poses(number)
         self._goal = np.zeros(3)
-        self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
+        self._set_posture(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
         mujoco.mj_forward(self.scene.model, self.data)
-        rollout = LiftTest()
+        rollout = LiftResult()
         if max(self.penetration()) > MAX_PENETRATION_M:
             rollout.outcome = LiftOutcome.PENETRATION
         return rollout
 
-    def _put(self, hand_pose: Floats, joints: Floats) -> None:
-        self.scene.place(self.data, hand_pose, joints)
+    def _set_posture(self, hand_pose: Floats, joints: Floats) -> None:
+        self.scene.set_posture(self.data, hand_pose, joints)
         self.data.mocap_pos[1], self.data.mocap_quat[1] = self._scene_pose[:3], self._scene_pose[3:]
         self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push_force * self._up
         for free, pose in zip(self.scene.neighbours, self._beside, strict=True):
@@ -136,7 +136,7 @@ class Lift(Test):
                 return True
         return False
 
-    def _touches(self, grasps: GraspSet, row: int) -> bool:
+    def _collides_on_approach(self, grasps: GraspSet, row: int) -> bool:
         """Check whether the open hand penetrates the object or a support on its approach."""
         assert grasps.approach is not None, "a lift needs the grasps' approach"
         assert grasps.coming is not None
@@ -148,10 +148,10 @@ class Lift(Test):
                 if self._in_contact(pose, joints):
                     return True
         wide, closed = Posture(path[-1:], joints[None]), grasps.pregrasp.take(slice(row, row + 1))
-        return any(self._in_contact(*blend(wide, closed, 0, float(share))) for share in shares)
+        return any(self._in_contact(*interpolate_postures(wide, closed, 0, float(share))) for share in shares)
 
     def _in_contact(self, hand_pose: Floats, joints: Floats) -> bool:
-        self._put(hand_pose, joints)
+        self._set_posture(hand_pose, joints)
         mujoco.mj_kinematics(self.scene.model, self.data)
         mujoco.mj_collision(self.scene.model, self.data)
         contact = self.data.contact
@@ -173,19 +173,19 @@ class Lift(Test):
             self._goal = share * RISE_M * self._up
             self.data.mocap_pos[0] = root[:3] + self._goal
             self._run(step_s)
-            if self._in_hand and number % LOSSES == 0 and self._is_lost():
+            if self._in_hand and number % LOSSES == 0 and self._is_dropped():
                 break
 
-    def _offset(self) -> Floats:
+    def _object_displacement(self) -> Floats:
         """Return the displacement (3,) of the object's frame from its commanded position [m]."""
-        at, yielded = super()._offset(), self._root_deviation()
+        at, yielded = super()._object_displacement(), self._root_deviation()
         if yielded is not None:
             root, turn = yielded
             at = self.data.mocap_pos[0] + quat_rotate(quat_conjugate(turn), at - root)
         return np.asarray(at - self._goal)
 
-    def _turned(self) -> Floats:
-        turned, yielded = super()._turned(), self._root_deviation()
+    def _rotation(self) -> Floats:
+        turned, yielded = super()._rotation(), self._root_deviation()
         return turned if yielded is None else quat_multiply(quat_conjugate(yielded[1]), turned)
 
     def _root_deviation(self) -> tuple[Floats, Floats] | None:
@@ -198,8 +198,8 @@ class Lift(Test):
         root = self.data.qpos[at : at + 7]
         return root[:3], quat_multiply(root[3:], quat_conjugate(self.data.mocap_quat[0]))
 
-    def _result(self, rollout: LiftTest, outcome: Outcome) -> LiftTest:
-        rollout.steps, rollout.margin = self._steps, self._excess()
+    def _complete_result(self, rollout: LiftResult, outcome: Outcome) -> LiftResult:
+        rollout.steps, rollout.margin = self._steps, self._motion_excess()
         rollout.outcome = _OUTCOMES[outcome]
         return rollout
 

@@ -21,11 +21,11 @@ from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation import lift as protocol
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import postures_key, verdict_key
-from graspd.worker.validation.lift import Lift, LiftOutcome, LiftTest
+from graspd.worker.validation.lift import Lift, LiftOutcome, LiftResult
 from graspd.worker.validation.model import TOUCH_ROUNDING_M, MujocoOptions, scene_of
 
 LiftLevel = Literal["dexgraspbench", "lift"]
-KnownLifts = dict[str, LiftTest]  # finished lifts, by `lift_digest`
+KnownLifts = dict[str, LiftResult]  # finished lifts, by `lift_digest`
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
 REVISION: Final = 5  # revision of the lift test's code; increase it if code (not a constant) changes verdicts
 _MOVES: Final = {surroundings: ("RISE_M",), protocol: ("LOOKS", "OVERHANG_M", "LOSSES"), postures: ("ROOM_M", "WIDE")}
@@ -78,7 +78,7 @@ def validate_lifts(
     scene = scene_of(hand, obj, pieces, physics, placed.supports, placed.neighbours)
     done, finished = Count(len(grasps), run, "lifts"), {} if known is None else known
 
-    def lift(test: Lift, row: int) -> LiftTest:
+    def lift(test: Lift, row: int) -> LiftResult:
         run.check("the validator")
         key = lift_digest(grasps, row, placed, hard=hard)
         if (rollout := finished.get(key)) is None:
@@ -103,7 +103,7 @@ def lift_digest(grasps: GraspSet, row: int, placed: PlacedGrasps, *, hard: bool)
     """Return the digest of all that determines a lift besides hand, object, level and fixed obstacles."""
     number = int(placed.index[row])
     around = [array[row] for array in (grasps.approach, grasps.coming) if array is not None]
-    around += [placed.object_pose[number], placed.scenes[number].up, *placed.neighbours_of(number)]
+    around += [placed.object_pose[number], placed.scenes[number].up, *placed.relative_neighbour_poses(number)]
     terms = digest_bytes(b"".join(np.asarray(array, float).tobytes() for array in around) + bytes([hard]))
     return postures_key(terms, grasps.take(slice(row, row + 1)))
 

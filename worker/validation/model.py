@@ -107,7 +107,7 @@ class Scene:
         """Force of a push, and weight of the object [N]."""
         return ACCELERATION * self.mass
 
-    def place(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
+    def set_posture(self, data: Any, hand_pose: Floats, joints: Floats) -> None:
         """Reset `data` with the hand in a posture (7,), (J,) and the object at its initial pose."""
         mujoco.mj_resetData(self.model, data)
         data.qpos[self.object_qpos : self.object_qpos + 7] = [*self.centre, 1, 0, 0, 0]
@@ -128,7 +128,7 @@ class Scene:
         return values if self.pulls is None else values @ self.pulls.T
 
 
-def build(
+def build_scene(
     hand: HandModel,
     obj: ObjectModel,
     pieces: ConvexPieces,
@@ -166,14 +166,14 @@ def build(
         support_geoms=np.asarray(support),
         neighbours=tuple(beside),
         tip_geoms=np.isin(body_of_geom, [model.body(f"body{b}").id for b in hand.fingertips]),
-        pressing=_pressing(model, supports),
+        pressing=_allowed_depth(model, supports),
     )
 
 
-scene_of = cached_by_content(8)(build)  # cached `build`; threads share the read-only scene
+scene_of = cached_by_content(8)(build_scene)  # cached `build_scene`; threads share the read-only scene
 
 
-def _pressing(model: Any, supports: Sequence[Obstacle]) -> Floats:
+def _allowed_depth(model: Any, supports: Sequence[Obstacle]) -> Floats:
     out = np.zeros(model.ngeom)
     for i, support in enumerate(supports):
         if support.tips_m is not None and support.tips_m < CLEAR_M:
@@ -202,7 +202,7 @@ def scene_spec(
     supports: Sequence[Obstacle] = (),
     neighbours: Sequence[Neighbour] = (),
 ) -> Any:
-    """Return the spec that `build` compiles.
+    """Return the spec that `build_scene` compiles.
     Names: `body0` ..., `joint1` ..., `dof0` ... (actuators), object, supports, `neighbour0` ..."""
     spec = empty_spec(physics.timestep)
     spec.option.noslip_iterations = physics.noslip_iterations
@@ -261,11 +261,11 @@ def _add_joint(body: Any, hand: HandModel, b: int) -> None:
         range=ends,
         limited=mujoco.mjtLimited.mjLIMITED_TRUE,
         damping=[DAMPING_TIME * float(hand.stiffness[d]), 0, 0],
-        **_mechanism(hand, b, d),
+        **_joint_properties(hand, b, d),
     )
 
 
-def _mechanism(hand: HandModel, b: int, d: int) -> dict[str, Any]:
+def _joint_properties(hand: HandModel, b: int, d: int) -> dict[str, Any]:
     """Return joint properties that the protocol lacks.
     A tendon presses a joint permanently against its limit, so the limit is as stiff as a coupling."""
     found: dict[str, Any] = {}
@@ -381,7 +381,7 @@ def add_support(spec: Any, geom: Any, support: Obstacle) -> None:
     mujoco.mju_quatZ2Vec(geom.quat, normal)
 
 
-def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Floats]:
+def interpolate_postures(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Floats]:
     """Interpolate postures a and b at `share`: positions and joints linearly, orientations by slerp."""
     start, end = a.hand_pose[row], b.hand_pose[row]
     pose = np.concatenate([(1 - share) * start[:3] + share * end[:3], slerp(start[3:], end[3:], share)])

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.matter import ACCELERATION, MASS_KG, MOST_KG
-from graspd.service.model.planning import limit_text
+from graspd.service.model.planning import payload_limit_text
 from graspd.service.model.transforms import Floats, cross, quat_rotate
 from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, measure_rows
@@ -40,7 +40,7 @@ from graspd.worker.quality.wrench_space import EDGES, cone_edges
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import Scene, scene_of
-from graspd.worker.validation.prescreening import HANGING_CLOSING, LIFTING, FixedRootScene
+from graspd.worker.validation.prescreening import HANGING_CLOSING, LIFTING, FixedRootTest
 from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test
 
 TOLD: Final = 1.03  # ratio of upper to lower bound at which the search ends; the payload is the lower bound
@@ -101,7 +101,7 @@ class _WeightTest(Test):
                 step **= 2
 
 
-class LiftPayload(_WeightTest, FixedRootScene):
+class LiftPayload(_WeightTest, FixedRootTest):
     """Payloads of grasps in one scene."""
 
     def payload(self, grasps: GraspSet, row: int) -> float:
@@ -134,7 +134,7 @@ class PushPayload(_WeightTest):
     def payload(self, grasps: GraspSet, row: int) -> float:
         """Return the payload [kg]; nan if the grasp does not hold the object under the pushes."""
         self._set_mass(self._own)
-        if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
+        if self._set_up_test(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return math.nan
         if not self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) or is_invalid(self.data):
             return math.nan
@@ -187,7 +187,7 @@ HOPELESS: Final = 2.0  # ratio of wanted mass to best payload above which the wa
 
 
 @dataclass(frozen=True)
-class Limit:
+class PayloadLimit:
     """Payload limit of some grasps of a hand."""
 
     hand: str
@@ -204,7 +204,7 @@ class Limit:
 
     @property
     def line(self) -> str:
-        return limit_text(self.hand, self.friction, self.grasps, self.lifts_kg, self.bound_kg, self.wanted_kg)
+        return payload_limit_text(self.hand, self.friction, self.grasps, self.lifts_kg, self.bound_kg, self.wanted_kg)
 
     def facts(self) -> dict[str, Any]:
         """Return the values for JSON; an infinite bound becomes None."""
@@ -212,7 +212,7 @@ class Limit:
         return {"lifts_kg": round(self.lifts_kg, 3), "bound_kg": bound, "grasps": self.grasps, "says": self.line}
 
 
-def limit_of(
+def payload_limit(
     hand: HandModel,
     obj: ObjectModel,
     grasps: GraspSet,
@@ -222,7 +222,7 @@ def limit_of(
     wanted: float | None = None,
     least: int = LEAST,
     run: ExecutionContext = DEFAULT_CONTEXT,
-) -> Limit | None:
+) -> PayloadLimit | None:
     """Return the payload limit of N grasps.
     None if a grasp lifts the `wanted` mass [kg], or if fewer than `least` grasps lift a light object."""
     if len(grasps) < least:
@@ -237,8 +237,8 @@ def limit_of(
     against = np.broadcast_to(-np.array(DIRECTIONS, float), (len(grasps), len(DIRECTIONS), 3))
     if placed is not None:
         against = np.array([[placed.scenes[number].up] for number in placed.index])
-    bound = float(capacities(hand, obj, grasps.grasp, against).max())
-    return Limit(hand.name, obj.friction, len(grasps), lifts, max(bound, lifts), wanted)
+    bound = float(load_capacities(hand, obj, grasps.grasp, against).max())
+    return PayloadLimit(hand.name, obj.friction, len(grasps), lifts, max(bound, lifts), wanted)
 
 
 #: Amplitude [m], frequency [Hz] and number of periods along each axis; the acceleration is at most 7.1 m/s2.
@@ -248,7 +248,7 @@ PERIODS: Final = 3
 STEP_S: Final = 0.008  # the force changes in steps of this length [s]
 
 
-class Shake(FixedRootScene):
+class Shake(FixedRootTest):
     """Shake tests of grasps in one scene. Not thread-safe."""
 
     def margin(self, grasps: GraspSet, row: int) -> float:
@@ -265,7 +265,7 @@ class Shake(FixedRootScene):
                 force = -self.scene.mass * (ACCELERATION * self._up + jerked)
                 self.data.xfrc_applied[self.scene.object_body, :3] = force
                 self._run(STEP_S)
-                worst = max(worst, LOST if is_invalid(self.data) else self._excess())
+                worst = max(worst, LOST if is_invalid(self.data) else self._motion_excess())
                 if worst >= 1.0:
                     return worst
         return worst
@@ -298,12 +298,12 @@ AT_STOP: Final = 0.02  # a joint closer to its limit than this share of its rang
 _UNBOUNDED: Final = 3  # status of `linprog` for an unbounded problem
 
 
-def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Floats) -> Floats:
+def load_capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Floats) -> Floats:
     """Compute load capacities (N,) [kg]; 0 without contact, inf if neither drives nor friction limit it.
     `against` (N, K, 3) are unit vectors against the weight; the least of the K capacities is returned."""
     probe = posture_data_of(hand, obj, points=_POINTS, device="cpu").probe
-    found = probe.touch(grasp)
-    facing = (found.distance < WITHIN_M) & probe.facing(found)
+    found = probe.nearest_points(grasp)
+    facing = (found.distance < WITHIN_M) & probe.facing_mask(found)
     spread, count = spread_contacts(facing[:, None], found.closest, found.normal, scale=obj.radius, limit=MOST)
     q = hand.reduce(grasp.joint_positions)
     out = np.zeros(len(grasp))

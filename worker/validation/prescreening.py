@@ -57,7 +57,7 @@ DEEP: Final = 20.0  # score of grasps that start in deep penetration
 Frictions = tuple[Scene, Scene]  # scenes compiled at half and at full friction; everything else is the same
 
 
-class LiftRollout(Lift):
+class ShortLiftTest(Lift):
     """Short lifts of grasps in one scene. Not thread-safe."""
 
     def __init__(self, scenes: Frictions, placed: PlacedGrasps) -> None:
@@ -68,7 +68,7 @@ class LiftRollout(Lift):
         """Return the ratio of motion to its limit after hanging at half friction; below 1 if lifted.
         Otherwise return the ratio at full friction plus `SLIPS`, or `beat` if `beat` is below 1 + `SLIPS`."""
         self.scene = self._half
-        if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
+        if self._set_up_scene(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return DEEP
         if not self._close(grasps, row, give_up=True, stages=CLOSING) or is_invalid(self.data):
             return LOST
@@ -90,7 +90,7 @@ class LiftRollout(Lift):
         return self._extrapolate(HANGING, enough)
 
 
-class PushRollout(Test):
+class ShortPushTest(Test):
     """Short pushes of grasps of a free object. Not thread-safe."""
 
     def __init__(self, scenes: Frictions) -> None:
@@ -101,7 +101,7 @@ class PushRollout(Test):
         """Return the largest ratio of motion to its limit in pushes at half friction; below 1 if held.
         Otherwise return the ratio at full friction plus `SLIPS`, or inf as soon as the score cannot be below `beat`."""
         self.scene = self._half
-        if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
+        if self._set_up_test(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return DEEP
         if not self._close(grasps, row, give_up=True, stages=FREE_CLOSING) or is_invalid(self.data):
             return LOST
@@ -121,7 +121,7 @@ class PushRollout(Test):
             self._restore()
             self.data.xfrc_applied[self.scene.object_body, :3] = PULL * self.scene.push_force * corner
             self._run(PUSHED * STAGE_S)
-            worst = max(worst, LOST if is_invalid(self.data) else self._excess())
+            worst = max(worst, LOST if is_invalid(self.data) else self._motion_excess())
             if worst >= enough:
                 break
         return worst
@@ -150,10 +150,10 @@ class ShortTests:
                 self._scenes = half, full
         scenes, least = self._scenes, np.full(len(grasps), np.inf) if beat is None else beat
 
-        def make() -> LiftRollout | PushRollout:
-            return PushRollout(scenes) if placed is None else LiftRollout(scenes, placed)
+        def make() -> ShortLiftTest | ShortPushTest:
+            return ShortPushTest(scenes) if placed is None else ShortLiftTest(scenes, placed)
 
-        def score(test: LiftRollout | PushRollout, row: int) -> float:
+        def score(test: ShortLiftTest | ShortPushTest, row: int) -> float:
             return test.score(grasps, row, float(least[row]))
 
         return np.array(evaluate_rows(range(len(grasps)), make, score, threads=self.threads, name="short-test"), float)
@@ -167,12 +167,12 @@ LOADING_S: Final = 0.04
 LOADS: Final = 5
 
 
-class FixedRootScene(Lift):
+class FixedRootTest(Lift):
     """Tests in a scene with a fixed root: the hand closes, and the object hangs. Not thread-safe."""
 
     def _closed(self, grasps: GraspSet, row: int) -> bool:
         """Close the hand around the object; return whether the object stays in the hand."""
-        if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
+        if self._set_up_scene(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return False
         return self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) and not is_invalid(self.data)
 

@@ -20,7 +20,7 @@ import numpy as np
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.validation.model import Scene, blend
+from graspd.worker.validation.model import Scene, interpolate_postures
 
 DIRECTIONS: Final = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 MAX_DISPLACEMENT_M: Final = 0.05
@@ -96,7 +96,7 @@ class Test:
 
     def dexgraspbench(self, grasps: GraspSet, row: int) -> Rollout:
         """Run the protocol as published, up to the first push that fails."""
-        rollout = self._start(grasps, row)
+        rollout = self._set_up_test(grasps, row)
         if rollout.outcomes[0] is Outcome.PENETRATION:
             return rollout
         self._close(grasps, row)
@@ -104,12 +104,12 @@ class Test:
 
     def standard(self, grasps: GraspSet, row: int) -> Rollout:
         """Close once, start every push from that state, and end each push as soon as it is decided."""
-        rollout = self._start(grasps, row)
+        rollout = self._set_up_test(grasps, row)
         if rollout.outcomes[0] is Outcome.PENETRATION:
             return rollout
         if not self._close(grasps, row, give_up=True) or self._validate(rollout) is not Outcome.HELD:
             # The result is wrong only if a push brings the object back inside the limits. None of 690 grasps did so.
-            rollout.margin = max(rollout.margin, self._excess())
+            rollout.margin = max(rollout.margin, self._motion_excess())
             rollout.steps = self._steps
             return rollout.fail(Outcome.DIVERGED if is_invalid(self.data) else Outcome.LOST_WHILE_CLOSING)
         return self._push_all(rollout, self._hold)
@@ -127,7 +127,7 @@ class Test:
         rollout.steps = self._steps
         return rollout
 
-    def _start(self, grasps: GraspSet, row: int) -> Rollout:
+    def _set_up_test(self, grasps: GraspSet, row: int) -> Rollout:
         self._steps = 0
         rollout = Rollout()
         rollout.penetration_m, rollout.self_penetration_m = self._depths(grasps.grasp, row)
@@ -136,11 +136,11 @@ class Test:
             return rollout.fail(Outcome.PENETRATION)
         return rollout
 
-    def _put(self, hand_pose: Floats, joints: Floats) -> None:
-        self.scene.place(self.data, hand_pose, joints)
+    def _set_posture(self, hand_pose: Floats, joints: Floats) -> None:
+        self.scene.set_posture(self.data, hand_pose, joints)
 
     def _depths(self, posture: Posture, row: int) -> tuple[float, float]:
-        self._put(posture.hand_pose[row], posture.joint_positions[row])
+        self._set_posture(posture.hand_pose[row], posture.joint_positions[row])
         # Only contacts are needed: forces and accelerations would cost three times as much.
         mujoco.mj_kinematics(self.scene.model, self.data)
         mujoco.mj_comPos(self.scene.model, self.data)
@@ -160,23 +160,23 @@ class Test:
     def _close(self, grasps: GraspSet, row: int, *, give_up: bool = False, stages: int = STAGES) -> bool:
         """Move from pregrasp through grasp to squeeze, each in `stages` stages.
         With `give_up`, return False as soon as the object is lost; without it, always return True."""
-        self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
+        self._set_posture(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
         for hand_pose, joints in self._way(grasps, row, stages):
             self.scene.command(self.data, hand_pose, joints)
             self._run(STAGE_S)
-            if give_up and self._is_lost():
+            if give_up and self._is_dropped():
                 return False
         return True
 
-    def _is_lost(self) -> bool:
-        moved, turned = self._motion()
+    def _is_dropped(self) -> bool:
+        moved, turned = self._object_motion()
         return moved > MAX_DISPLACEMENT_M or turned > LOST_ROTATION
 
     def _way(self, grasps: GraspSet, row: int, stages: int = STAGES) -> Iterator[tuple[Floats, Floats]]:
         """Yield commanded postures (7,), (J,) from pregrasp through grasp to squeeze, one per stage."""
         for a, b in ((grasps.pregrasp, grasps.grasp), (grasps.grasp, grasps.squeeze)):
             for stage in range(1, stages + 1):
-                yield blend(a, b, row, stage / stages)
+                yield interpolate_postures(a, b, row, stage / stages)
 
     def _save(self) -> None:
         mujoco.mj_getState(self.scene.model, self.data, self._saved, mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -200,14 +200,14 @@ class Test:
         """Simulate a push: reject once a limit is exceeded, accept once faster motion would stay below it."""
         elapsed = FIRST_LOOK_S - INTERVAL_S
         self._run(elapsed)
-        before, turned_before = self._offset(), self._motion()[1]
+        before, turned_before = self._object_displacement(), self._object_motion()[1]
         while elapsed < HOLD_S - 1e-9:
             self._run(INTERVAL_S)
             elapsed += INTERVAL_S
             outcome = self._validate(rollout)
             if outcome is not Outcome.HELD:
                 return outcome
-            now, turned = self._offset(), self._motion()[1]
+            now, turned = self._object_displacement(), self._object_motion()[1]
             more = AHEAD * (HOLD_S - elapsed) / INTERVAL_S
             ahead = float(np.linalg.norm(now + more * (now - before)))
             turns = turned + more * (turned - turned_before)
@@ -219,10 +219,10 @@ class Test:
     def _extrapolate(self, stages: int, enough: float = 1.0) -> float:
         """Return the larger ratio of displacement or rotation to its limit, extrapolated from now to `HOLD_S`.
         Simulate at most `stages` stages; as soon as the present value reaches `enough`, return it."""
-        before = self._excess()
+        before = self._motion_excess()
         for stage in range(1, stages + 1):
             self._run(STAGE_S)
-            excess = LOST if is_invalid(self.data) else self._excess()
+            excess = LOST if is_invalid(self.data) else self._motion_excess()
             ahead = excess + max(0.0, excess - before) * (HOLD_S / STAGE_S - stage)
             if excess >= enough or (stage > 1 and ahead < STILL):
                 return excess
@@ -234,30 +234,30 @@ class Test:
         mujoco.mj_step(self.scene.model, self.data, nstep=steps)
         self._steps += steps
 
-    def _offset(self) -> Floats:
+    def _object_displacement(self) -> Floats:
         """Return the displacement (3,) of the object's (mesh) frame since the start, as published [m]."""
         at = self.scene.object_qpos
         turned = np.empty(3)
         mujoco.mju_rotVecQuat(turned, self.scene.centre, self.data.qpos[at + 3 : at + 7])
         return np.asarray(self.data.qpos[at : at + 3] - turned)
 
-    def _turned(self) -> Floats:
+    def _rotation(self) -> Floats:
         at = self.scene.object_qpos
         return np.asarray(self.data.qpos[at + 3 : at + 7])
 
-    def _motion(self) -> tuple[float, float]:
-        q = self._turned()
+    def _object_motion(self) -> tuple[float, float]:
+        q = self._rotation()
         turned = 2 * math.atan2(math.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2), abs(q[0]))
-        return float(np.linalg.norm(self._offset())), turned
+        return float(np.linalg.norm(self._object_displacement())), turned
 
-    def _excess(self) -> float:
-        moved, turned = self._motion()
+    def _motion_excess(self) -> float:
+        moved, turned = self._object_motion()
         return max(moved / MAX_DISPLACEMENT_M, turned / MAX_ROTATION)
 
     def _validate(self, rollout: Rollout) -> Outcome:
         if is_invalid(self.data):
             return Outcome.DIVERGED
-        moved, turned = self._motion()
+        moved, turned = self._object_motion()
         rollout.margin = max(rollout.margin, moved / MAX_DISPLACEMENT_M, turned / MAX_ROTATION)
         if not moved < MAX_DISPLACEMENT_M:
             return Outcome.DISPLACED

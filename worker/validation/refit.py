@@ -13,7 +13,7 @@ from typing import Final, Literal
 import numpy as np
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert, quat_from_matrix
-from graspd.worker.hands.collisions import resting_neighbours
+from graspd.worker.hands.collisions import collision_exempt_pairs
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.primitives import hull, sample, signed_distance, tessellate, volume
 
@@ -31,7 +31,7 @@ def refit_hand(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
     Contacts of bodies whose new shapes touch at rest are ignored."""
     pieces = hand.pieces
     if fit == "hull":
-        pieces = _hulls(hand)
+        pieces = _hulls_of_links(hand)
     elif fit != "own":
         pieces = tuple(_fit_piece(piece, fit) for piece in pieces)
     if grown_m:
@@ -39,10 +39,10 @@ def refit_hand(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
     if len(pieces) == len(hand.pieces) and all(a is b for a, b in zip(pieces, hand.pieces, strict=True)):
         return hand
     other = replace(hand, pieces=pieces)
-    return replace(other, neighbours=hand.neighbours | resting_neighbours(other))
+    return replace(other, neighbours=hand.neighbours | collision_exempt_pairs(other))
 
 
-def fits_of(hand: HandModel) -> frozenset[Fit]:
+def applicable_fits(hand: HandModel) -> frozenset[Fit]:
     links = {(piece.body, piece.link) for piece in hand.pieces}
     found: set[Fit] = set()
     if len(links) < len(hand.pieces):
@@ -59,7 +59,7 @@ def offset_piece(piece: ConvexPiece, by_m: float) -> ConvexPiece:
     Boxes and cylinders keep their edges; capsules and spheres are offset exactly. Corners of a hull are cut at the
     surface of the Minkowski sum with a ball. A piece too thin to shrink by this much keeps half of its thickness."""
     if piece.kind == "hull":
-        vertices, faces = hull(_offset(piece.vertices, by_m))
+        vertices, faces = hull(_offset_hull(piece.vertices, by_m))
         return replace(piece, vertices=vertices, faces=faces)
     size = np.array(piece.size)
     half = size / 2 if piece.kind == "box" else np.array([size[0]])
@@ -80,7 +80,7 @@ def _primitive(piece: ConvexPiece, kind: str, size: tuple[float, ...], pose: Flo
     return replace(piece, kind=kind, size=size, pose=pose, vertices=apply(pose, vertices), faces=faces)
 
 
-def _hulls(hand: HandModel) -> tuple[ConvexPiece, ...]:
+def _hulls_of_links(hand: HandModel) -> tuple[ConvexPiece, ...]:
     out: list[ConvexPiece] = []
     ordered = sorted(hand.pieces, key=lambda piece: (piece.body, piece.link))
     for _, group in groupby(ordered, key=lambda piece: (piece.body, piece.link)):
@@ -97,7 +97,7 @@ def _fit_piece(piece: ConvexPiece, fit: Fit) -> ConvexPiece:
         if piece.kind != "hull":
             return piece
         found = [_primitive_like(piece, kind) for kind in _PRIMITIVES]
-        return min(found, key=lambda one: _distance(one, piece))
+        return min(found, key=lambda one: _mean_distance(one, piece))
     return piece if piece.kind in ("capsule", "sphere") or not _is_round(piece) else _primitive_like(piece, "capsule")
 
 
@@ -133,14 +133,14 @@ def _primitive_like(piece: ConvexPiece, kind: str) -> ConvexPiece:
     size = {
         "box": tuple(float(side) for side in np.sqrt(12 * spread)),
         "cylinder": (radius, math.sqrt(12 * float(spread[2]))),
-        "capsule": _capsule(solid, across),
+        "capsule": _capsule_size(solid, across),
     }[kind]
     scale = (solid / volume(kind, size, *tessellate(kind, size))) ** (1 / 3)
     pose = np.concatenate([centre, quat_from_matrix(axes)])
     return _primitive(piece, kind, tuple(scale * side for side in size), pose)
 
 
-def _capsule(solid: float, across: float) -> tuple[float, float]:
+def _capsule_size(solid: float, across: float) -> tuple[float, float]:
     """Return radius and length of a capsule of a volume [m^3] and a variance across its axis [m^2].
     The variance is r^2 (1 / 4 - s / 20), where s is the caps' share of the volume: 1 for a ball. The solution iterates,
     since s grows with r^3 and has little effect on r."""
@@ -151,14 +151,14 @@ def _capsule(solid: float, across: float) -> tuple[float, float]:
     return radius, max(_SHORTEST * radius, solid / (math.pi * radius**2) - 4 * radius / 3)
 
 
-def _distance(one: ConvexPiece, piece: ConvexPiece) -> float:
+def _mean_distance(one: ConvexPiece, piece: ConvexPiece) -> float:
     """Return the mean distance of a piece's surface from the surface of a primitive [m]."""
     points, _ = sample("hull", (), piece.vertices, piece.faces, _SAMPLES, np.random.default_rng(0))
     local = apply(invert(one.pose), points)
     return float(np.abs(signed_distance(one.kind, one.size, one.vertices, one.faces, local)).mean())
 
 
-def _offset(vertices: Floats, by_m: float) -> Floats:
+def _offset_hull(vertices: Floats, by_m: float) -> Floats:
     """Return the corners of a convex solid with its faces moved outward by `by_m` [m].
     The result is the intersection of half-spaces along the face normals and, if growing, the mean normals at corners.
     In these directions it has the support function of the Minkowski sum with a ball."""
@@ -170,7 +170,7 @@ def _offset(vertices: Floats, by_m: float) -> Floats:
     normals = np.unique(np.round(solid.equations[:, :3], 9), axis=0)
     inside = points.mean(axis=0)
     if by < 0:
-        inside, depth = _deepest(solid.equations)
+        inside, depth = _largest_ball(solid.equations)
         by = max(by, -_LEFT * depth)
     else:
         corner = np.zeros_like(points)
@@ -184,7 +184,7 @@ def _offset(vertices: Floats, by_m: float) -> Floats:
     return np.asarray(found * scale + vertices.mean(axis=0))
 
 
-def _deepest(planes: Floats) -> tuple[Floats, float]:
+def _largest_ball(planes: Floats) -> tuple[Floats, float]:
     """Return centre and radius of the largest ball in a convex solid of unit planes (F, 4): n x + b <= 0."""
     from scipy.optimize import linprog
 

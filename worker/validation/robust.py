@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.metrics import ROBUST_MODELS, Axis
+from graspd.service.model.metrics import ROBUST_MODELS, PerturbedParameter
 from graspd.service.model.transforms import Floats
 from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
 from graspd.worker.grasps import GraspSet
@@ -48,7 +48,7 @@ class Robustness:
         After an early end the share is a lower bound if the wanted share was reached, else an upper bound."""
         models = self.held.shape[1]
         held, failed = (self.held == 1).sum(axis=1), (self.held == 0).sum(axis=1)
-        reached = held >= needed_models(self.wanted, models)
+        reached = held >= required_model_count(self.wanted, models)
         share = np.where(reached, held, models - failed) / models
         return np.where((self.held == NOT_VALIDATED).all(axis=1), np.nan, share)
 
@@ -57,19 +57,19 @@ class Robustness:
         """(N,) `Axis` of the first model in which a grasp does not hold; 0 if it holds in all."""
         failed = self.held == 0
         first = failed.argmax(axis=1)
-        return np.where(failed.any(axis=1), self.axis[np.arange(len(first)), first], np.uint8(Axis.NONE))
+        return np.where(failed.any(axis=1), self.axis[np.arange(len(first)), first], np.uint8(PerturbedParameter.NONE))
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
         return {"quality/robust_share": self.share, "quality/robust_weakest": self.weakest}
 
-    def by_axis(self) -> dict[Axis, tuple[int, int]]:
+    def by_axis(self) -> dict[PerturbedParameter, tuple[int, int]]:
         """Return the number of models in which a grasp held, and of all models, for each validated axis."""
-        validated = {axis: self.held[(self.axis == axis) & (self.held != NOT_VALIDATED)] for axis in Axis}
+        validated = {axis: self.held[(self.axis == axis) & (self.held != NOT_VALIDATED)] for axis in PerturbedParameter}
         return {axis: (int(held.sum()), len(held)) for axis, held in validated.items() if len(held)}
 
 
-def needed_models(wanted: float, models: int) -> int:
+def required_model_count(wanted: float, models: int) -> int:
     """Return the number of models in which a grasp must hold for a wanted share; all of them for share 0."""
     return math.ceil(wanted * models - _EXACT) if wanted > 0 else models
 
@@ -115,15 +115,15 @@ def validate_robustness(
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
     beside = (placed.supports, placed.neighbours) if placed is not None else ()
     around = Models(hand, obj, pieces or decompose(obj), physics, *beside)
-    least, done = needed_models(wanted, models), Count(len(tried), run, "robustness")
+    least, done = required_model_count(wanted, models), Count(len(tried), run, "robustness")
 
     def holds(row: int, variant: Variant) -> bool:
         if placed is None:
             return around.standard(grasps, row, variant).success
         return around.lift(grasps, row, placed, variant, dexgraspbench=level == "dexgraspbench").success
 
-    def work(row: int) -> None:
-        for k, (axis, variant) in enumerate(models_of(hand, grasps, row, models, seed)):
+    def validate_row(row: int) -> None:
+        for k, (axis, variant) in enumerate(draw_models(hand, grasps, row, models, seed)):
             run.check("robustness")
             axes[row, k] = axis
             verdicts[row, k] = holds(row, variant)
@@ -133,11 +133,13 @@ def validate_robustness(
         done.add(1)
 
     with ThreadPoolExecutor(run.cores, thread_name_prefix="robust") as pool:
-        list(pool.map(work, tried.tolist()))
+        list(pool.map(validate_row, tried.tolist()))
     return Robustness(verdicts, axes, wanted, time.perf_counter() - began)
 
 
-def models_of(hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int) -> list[tuple[Axis, Variant]]:
+def draw_models(
+    hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int
+) -> list[tuple[PerturbedParameter, Variant]]:
     """Return the axis and the variant of each model in which one grasp is validated."""
     whole = hashlib.sha256()
     for part in (grasps.pregrasp, grasps.grasp, grasps.squeeze):

@@ -16,7 +16,7 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext, evaluate_rows
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.disk_cache import content_of
+from graspd.worker.objects.disk_cache import content_digest
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import Level, postures_key, verdict_key
@@ -196,7 +196,7 @@ def _run_tests(
     bare = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
     parts = [bare.take(np.array(rows[k : k + _CHUNK], np.intp)) for k in range(0, len(rows), _CHUNK)]
     made = run.pool.map(
-        _rollouts, content_of(case), case, parts, cancelled=run.cancelled, done=lambda k: done.add(len(parts[k]))
+        _rollouts, content_digest(case), case, parts, cancelled=run.cancelled, done=lambda k: done.add(len(parts[k]))
     )
     rollouts.update(zip(rows, (rollout for part in made for rollout in part), strict=True))
 

@@ -15,17 +15,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.metrics import Axis
+from graspd.service.model.metrics import PerturbedParameter
 from graspd.service.model.transforms import Floats, compose, invert, quat_from_axis_angle
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import Neighbour, Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
-from graspd.worker.validation.lift import Lift, LiftTest
-from graspd.worker.validation.model import MujocoOptions, Scene, blend, build, scene_of
+from graspd.worker.validation.lift import Lift, LiftResult
+from graspd.worker.validation.model import MujocoOptions, Scene, build_scene, interpolate_postures, scene_of
 from graspd.worker.validation.protocol import STAGES, Rollout, Test
-from graspd.worker.validation.refit import Fit, fits_of, refit_hand
+from graspd.worker.validation.refit import Fit, applicable_fits, refit_hand
 
 Vector = tuple[float, float, float]
 
@@ -68,11 +68,11 @@ class Variant:
 NOMINAL: Final = Variant()
 
 
-def axes_of(hand: HandModel) -> tuple[Axis, ...]:
+def axes_of(hand: HandModel) -> tuple[PerturbedParameter, ...]:
     """Return the axes along which models of this hand can differ; couplings only where joints are coupled."""
-    missing = set() if couplings_of(hand) else {Axis.COUPLINGS}
-    missing |= {Axis.ORDER} if len(hand.fingertips) < 2 else set()
-    return tuple(axis for axis in Axis if axis is not Axis.NONE and axis not in missing)
+    missing = set() if couplings_of(hand) else {PerturbedParameter.COUPLINGS}
+    missing |= {PerturbedParameter.ORDER} if len(hand.fingertips) < 2 else set()
+    return tuple(axis for axis in PerturbedParameter if axis is not PerturbedParameter.NONE and axis not in missing)
 
 
 def couplings_of(hand: HandModel) -> tuple[Coupling, ...]:
@@ -81,40 +81,43 @@ def couplings_of(hand: HandModel) -> tuple[Coupling, ...]:
     return (*rigid, "separate", "ratio") if hand.tendons else rigid
 
 
-def first_axes(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis]:
+def first_axes(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[PerturbedParameter]:
     """Return the axes of a grasp's first models: all axes in random order, then all in another order."""
     axes = axes_of(hand)
     rounds = range(-(-models // len(axes)))
     return [axes[i] for k in rounds for i in np.random.default_rng((*seed, k)).permutation(len(axes))][:models]
 
 
-def draw_variant(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
+def draw_variant(axis: PerturbedParameter, hand: HandModel, rng: np.random.Generator) -> Variant:
     """Draw a variant of a hand along one axis. Raises ValueError: no axis, or the hand has no couplings.
     Directions are uniform on the sphere, sizes uniform in their range, factors log-uniform."""
     match axis:
-        case Axis.SHAPES:
-            fits = {"own", *fits_of(hand)}
+        case PerturbedParameter.SHAPES:
+            fits = {"own", *applicable_fits(hand)}
             fit, grown = SHAPES[int(rng.choice([i for i, (fit, _) in enumerate(SHAPES) if fit in fits]))]
             return Variant(fit=fit, grown_m=grown)
-        case Axis.JOINTS:
-            armature, dry = (float(rng.random() < 0.5) * _factor(rng) for _ in range(2))
+        case PerturbedParameter.JOINTS:
+            armature, dry = (float(rng.random() < 0.5) * _draw_factor(rng) for _ in range(2))
             return Variant(
-                armature=ARMATURE * armature, dry_friction=DRY_FRICTION * dry, damping=_factor(rng), gain=_factor(rng)
+                armature=ARMATURE * armature,
+                dry_friction=DRY_FRICTION * dry,
+                damping=_draw_factor(rng),
+                gain=_draw_factor(rng),
             )
-        case Axis.COUPLINGS:
+        case PerturbedParameter.COUPLINGS:
             found = couplings_of(hand)
             return Variant(coupling=found[int(rng.integers(len(found)))])
-        case Axis.FRICTION:
+        case PerturbedParameter.FRICTION:
             return Variant(friction=float(rng.uniform(*FRICTIONS)))
-        case Axis.MASS:
-            return Variant(mass=_factor(rng))
-        case Axis.CENTRE:
-            return Variant(centre_m=_vector(rng, CENTRE_M))
-        case Axis.POSE:
-            return Variant(object_shift_m=_vector(rng, SHIFT_M), object_turn=_vector(rng, TURN))
-        case Axis.CALIBRATION:
-            return Variant(hand_shift_m=_vector(rng, SHIFT_M))
-        case Axis.ORDER:
+        case PerturbedParameter.MASS:
+            return Variant(mass=_draw_factor(rng))
+        case PerturbedParameter.CENTRE:
+            return Variant(centre_m=_draw_vector(rng, CENTRE_M))
+        case PerturbedParameter.POSE:
+            return Variant(object_shift_m=_draw_vector(rng, SHIFT_M), object_turn=_draw_vector(rng, TURN))
+        case PerturbedParameter.CALIBRATION:
+            return Variant(hand_shift_m=_draw_vector(rng, SHIFT_M))
+        case PerturbedParameter.ORDER:
             fingers = len(hand.fingertips)
             return Variant(lags=tuple((LATEST * rng.permutation(fingers) / (fingers - 1)).tolist()))
         case _:
@@ -131,11 +134,11 @@ SHAPES: Final[tuple[tuple[Fit, float], ...]] = (
 )
 
 
-def _factor(rng: np.random.Generator) -> float:
+def _draw_factor(rng: np.random.Generator) -> float:
     return float(FACTOR ** rng.uniform(-1.0, 1.0))
 
 
-def _vector(rng: np.random.Generator, most: float) -> Vector:
+def _draw_vector(rng: np.random.Generator, most: float) -> Vector:
     direction = rng.normal(size=3)
     x, y, z = (most * rng.random() * direction / np.linalg.norm(direction)).tolist()
     return x, y, z
@@ -214,30 +217,30 @@ class Models:
         self._scenes: dict[_Build, Scene] = {("own", 0.0, "own"): scene_of(hand, obj, pieces, physics, *self._around)}
         self._hands: dict[_Build, HandModel] = {("own", 0.0, "own"): hand}
         self._lock = threading.Lock()
-        self._fingers = _fingers(hand)
+        self._fingers = _finger_of_joint(hand)
 
     def standard(self, grasps: GraspSet, row: int, variant: Variant) -> Rollout:
         """Validate one grasp in a variant at level standard, for the nominal one bit for bit as `validate`."""
         test = VariantTest(self.scene(variant), variant, self._lags(variant))
-        return test.standard(self._projected(test.scene, displaced_grasp(self.obj, grasps, row, variant)), 0)
+        return test.standard(self._project_joints(test.scene, displace_grasp(self.obj, grasps, row, variant)), 0)
 
     def lift(
         self, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, *, dexgraspbench: bool = False
-    ) -> LiftTest:
+    ) -> LiftResult:
         """Lift a grasp in a variant; for the nominal variant the result equals `validate_lifts` bit for bit.
         `placed` has the scenes of all grasps. `dexgraspbench`: run the published test, which needs no approach."""
         number = int(placed.index[row])
         variant = restrict_to_support(variant, placed.scenes[number].up)
-        one, where = displaced_grasp(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))
+        one, where = displace_grasp(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))
         if moves_object(variant):
-            pose = compose(placed.object_pose[number], motion_of(self.obj, variant))
+            pose = compose(placed.object_pose[number], object_motion(self.obj, variant))
             beside = placed.neighbour_pose[number : number + 1]
             where = replace(placed, object_pose=pose[None], index=np.zeros(1, np.intp), neighbour_pose=beside)
         test = VariantLift(self.scene(variant), where, variant, self._lags(variant))
-        one = self._projected(test.scene, one)
+        one = self._project_joints(test.scene, one)
         return test.dexgraspbench(one, 0) if dexgraspbench else test.lift(one, 0)
 
-    def _projected(self, scene: Scene, one: GraspSet) -> GraspSet:
+    def _project_joints(self, scene: Scene, one: GraspSet) -> GraspSet:
         """Project the grasp onto the postures of a hand with fewer dofs."""
         if scene.hand.dofs < self.hand.dofs:
             for part in (one.grasp, one.pregrasp, one.squeeze):
@@ -252,12 +255,14 @@ class Models:
         with self._lock:
             if built not in self._scenes:
                 self._hands[built] = replace_coupling(refit_hand(self.hand, *built[:2]), built[2])
-                self._scenes[built] = build(self._hands[built], self.obj, self._pieces, self._physics, *self._around)
+                self._scenes[built] = build_scene(
+                    self._hands[built], self.obj, self._pieces, self._physics, *self._around
+                )
             scene = self._scenes[built]
         if any(variant.centre_m):
             # The body's frame is at the centre of mass.
             obj = replace(self.obj, centre_of_mass=self.obj.centre_of_mass + variant.centre_m)
-            scene = build(self._hands[built], obj, self._pieces, self._physics, *self._around)
+            scene = build_scene(self._hands[built], obj, self._pieces, self._physics, *self._around)
         return _perturbed_scene(scene, variant)
 
     def _lags(self, variant: Variant) -> Floats | None:
@@ -268,7 +273,7 @@ class Models:
         return np.asarray(lags[self._fingers + 1])
 
 
-class _OneByOne(Test):
+class _DelayedFingersTest(Test):
     """A test in which fingers may start to close one after another."""
 
     __test__ = False
@@ -282,7 +287,7 @@ class _OneByOne(Test):
         for stage in range(1, 2 * stages + 1):
             even = stage / stages
             part = int(even >= 1)
-            pose, _ = blend(parts[part], parts[part + 1], row, even - part)
+            pose, _ = interpolate_postures(parts[part], parts[part + 1], row, even - part)
             # Delayed joints move faster, so that all arrive at the same time.
             late = np.clip((even / 2 - self._lags) / (1 - self._lags.max()), 0, 1) * 2
             joints = [part.joint_positions[row] for part in parts]
@@ -291,7 +296,7 @@ class _OneByOne(Test):
             yield pose, np.where(late <= 1, closing, (1 - second) * joints[1] + second * joints[2])
 
 
-class VariantTest(_OneByOne):
+class VariantTest(_DelayedFingersTest):
     __test__ = False
 
     def __init__(self, scene: Scene, variant: Variant, lags: Floats | None) -> None:
@@ -303,15 +308,15 @@ class VariantTest(_OneByOne):
         self.data.xfrc_applied[self.scene.object_body, :3] *= self._weight
 
 
-class VariantLift(_OneByOne, Lift):
+class VariantLift(_DelayedFingersTest, Lift):
     __test__ = False
 
     def __init__(self, scene: Scene, placed: PlacedGrasps, variant: Variant, lags: Floats | None) -> None:
         super().__init__(scene, placed)
         self._weight, self._lags = variant.mass, lags
 
-    def _put(self, hand_pose: Floats, joints: Floats) -> None:
-        super()._put(hand_pose, joints)
+    def _set_posture(self, hand_pose: Floats, joints: Floats) -> None:
+        super()._set_posture(hand_pose, joints)
         self.data.xfrc_applied[self.scene.object_body, :3] *= self._weight
 
 
@@ -343,19 +348,24 @@ def _perturbed_scene(scene: Scene, variant: Variant) -> Scene:
     return replace(scene, model=model)
 
 
-def displaced_grasp(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> GraspSet:
+def displace_grasp(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> GraspSet:
     """Return one grasp relative to the object, for a variant that displaces object or hand."""
     one = grasps.take(np.array([row]))
     if not (moves_object(variant) or any(variant.hand_shift_m)):
         return one
-    back, off = invert(motion_of(obj, variant)), np.array([*variant.hand_shift_m, 1.0, 0, 0, 0])
+    back, off = invert(object_motion(obj, variant)), np.array([*variant.hand_shift_m, 1.0, 0, 0, 0])
 
-    def moved(part: Posture) -> Posture:
+    def displace(part: Posture) -> Posture:
         return Posture(compose(compose(back, part.hand_pose), off), part.joint_positions)
 
     way = None if one.approach is None else compose(compose(back, one.approach), off)
     return replace(
-        one, grasp=moved(one.grasp), pregrasp=moved(one.pregrasp), squeeze=moved(one.squeeze), approach=way, lift=None
+        one,
+        grasp=displace(one.grasp),
+        pregrasp=displace(one.pregrasp),
+        squeeze=displace(one.squeeze),
+        approach=way,
+        lift=None,
     )
 
 
@@ -363,7 +373,7 @@ def moves_object(variant: Variant) -> bool:
     return any((*variant.object_shift_m, *variant.object_turn))
 
 
-def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
+def object_motion(obj: ObjectModel, variant: Variant) -> Floats:
     """Return the motion (7,) from the nominal to the displaced object, in the object's frame."""
     turn = np.array(variant.object_turn)
     angle = float(np.linalg.norm(turn))
@@ -381,7 +391,7 @@ def restrict_to_support(variant: Variant, up: Floats) -> Variant:
     return replace(variant, object_shift_m=tuple(level.tolist()), object_turn=tuple(about.tolist()))
 
 
-def _fingers(hand: HandModel) -> NDArray[np.intp]:
+def _finger_of_joint(hand: HandModel) -> NDArray[np.intp]:
     """Return the index (J,) in `hand.fingertips` of the one tip that a joint moves; -1 if several or none."""
     moved: list[set[int]] = [set() for _ in range(hand.bodies)]
     for place, tip in enumerate(hand.fingertips):

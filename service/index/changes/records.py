@@ -11,7 +11,7 @@ from typing import Any, Final
 from sqlalchemy import ColumnElement, Connection, Table, delete, exists, func, literal, select, tuple_, update
 
 from graspd.service.index.database import IndexPart, chunks, rows_in, update_rows, upsert
-from graspd.service.index.outbox import append_ends
+from graspd.service.index.outbox import append_end_events
 from graspd.service.index.tables import (
     assets,
     attempts,
@@ -28,7 +28,7 @@ from graspd.service.index.tables import (
 )
 from graspd.service.model.domain import Asset, JobOptions
 from graspd.service.model.errors import LoadError, SceneError
-from graspd.service.model.messages import WorkerBeat
+from graspd.service.model.messages import WorkerHeartbeat
 from graspd.service.model.planning import (
     TaskFacts,
     count_ranges,
@@ -78,7 +78,7 @@ def job_row(record: JobRecord) -> Row:
 
 
 def neighbour_digests(options: JobOptions) -> str:
-    return " ".join(dict.fromkeys(one.digest or "" for one in options.beside))
+    return " ".join(dict.fromkeys(one.digest or "" for one in options.all_neighbours))
 
 
 NO_PROGRESS: Final = {"progress_done": 0.0, "progress_total": 0.0, "progress_message": None}
@@ -138,8 +138,8 @@ def grasp_rows(manifest: ShardManifest) -> list[Row]:
         "shard_id": manifest.shard_id,
         "hand": manifest.hand,
         "object": manifest.object,
-        "scene_kind": manifest.request.place.kind,
-        "neighbours": len(manifest.request.beside),
+        "scene_kind": manifest.request.scene_spec.kind,
+        "neighbours": len(manifest.request.all_neighbours),
         "created": manifest.created,
     }
     return [of_shard | {"row": row} | grasp.model_dump() for row, grasp in enumerate(manifest.grasps)]
@@ -201,7 +201,7 @@ def derive_task_and_job_states(
 
 
 def _derive_task_states(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> None:
-    query = select(jobs.c.id, jobs.c.cancelled, _first_batch_failed()).where(jobs.c.id.in_(list(touched)))
+    query = select(jobs.c.id, jobs.c.cancelled, _first_batch_failed_condition()).where(jobs.c.id.in_(list(touched)))
     facts = {row.id: row for row in connection.execute(query)}
     cancelled = {job for job, row in facts.items() if row.cancelled or row.hopeless}
     whole = [job for job, batches in touched.items() if batches is None or (job in facts and facts[job].hopeless)]
@@ -223,7 +223,7 @@ def _derive_task_states(connection: Connection, touched: Mapping[str, Collection
             connection.execute(update(tasks).where(tasks.c.id.in_(some)).values(state=state, ready=ready))
 
 
-def _first_batch_failed() -> ColumnElement[bool]:
+def _first_batch_failed_condition() -> ColumnElement[bool]:
     """Return the condition that a job's first batch failed because of its scenes or the object's weight."""
     last = (attempts.c.task_id == tasks.c.id) & (attempts.c.number == tasks.c.last_attempt)
     failed = (tasks.c.done.is_(False), tasks.c.exhausted.is_(True), tasks.c.last_attempt > tasks.c.retried_upto)
@@ -276,7 +276,7 @@ def _derive_job_states(connection: Connection, ids: Sequence[str]) -> dict[str, 
                 about = {"kind": "job", "subject": job, "state": state.value}
                 ended.append(about | {"project": row["project"], "owner": row["owner"]})
     if not connection.get_execution_options().get(QUIET):
-        append_ends(connection, ended)
+        append_end_events(connection, ended)
     return states
 
 
@@ -295,17 +295,17 @@ class Changes(IndexPart):
             return derive_states(connection, record.id)
 
     def enter_job(self, record: JobRecord, *, within: Connection) -> None:
-        """Add a job with its first `RANGES_AT_ONCE` ranges of tasks; `enter_more` adds the other ones."""
+        """Add a job with its first `RANGES_AT_ONCE` ranges of tasks; `enter_next_tasks` adds the other ones."""
         is_new = within.scalar(select(jobs.c.id).where(jobs.c.id == record.id)) is None
         self._upsert_job(within, record)
-        self._enter(within, record, 0, goes_on=is_new)
+        self._enter_ranges(within, record, 0, goes_on=is_new)
 
     def partly_entered_jobs(self) -> list[str]:
         """Return the ids of jobs with tasks that are not yet in the index."""
         query = select(notes.c.name).where(notes.c.name.startswith(ENTERING)).order_by(notes.c.name)
         return [name.removeprefix(ENTERING) for name in self.database.column(query)]
 
-    def enter_more(self, job_id: str, record: JobRecord | None) -> None:
+    def enter_next_tasks(self, job_id: str, record: JobRecord | None) -> None:
         """Add the next tasks of a large job; without a record (None), for example after a deletion, stop."""
         with self.database.write_transaction() as connection:
             exists_now = connection.scalar(select(jobs.c.id).where(jobs.c.id == job_id)) is not None
@@ -313,7 +313,7 @@ class Changes(IndexPart):
             if record is None or not exists_now:
                 connection.execute(delete(notes).where(notes.c.name == ENTERING + job_id))
             elif note is not None:
-                self._enter(connection, record, note["range"], goes_on=True)
+                self._enter_ranges(connection, record, note["range"], goes_on=True)
 
     def add_manifests(
         self, manifests: Iterable[ShardManifest], *, within: Connection | None = None
@@ -328,7 +328,7 @@ class Changes(IndexPart):
             upsert(connection, grasps, [row for manifest in new.values() for row in grasp_rows(manifest)])
             for some in chunks(list(new)):
                 made = update(tasks).where(tasks.c.shard_id == shards.c.id, shards.c.id.in_(some))
-                made = made.values(_outcome(*_OUTCOME)).returning(tasks.c.job_id, tasks.c.batch)
+                made = made.values(_finished_task_columns(*_OUTCOME)).returning(tasks.c.job_id, tasks.c.batch)
                 for job, batch in connection.execute(made):
                     touched[job].add(batch)
             return derive_task_and_job_states(connection, touched)
@@ -377,12 +377,12 @@ class Changes(IndexPart):
 
     def _upsert_tasks(self, connection: Connection, rows: list[Row]) -> None:
         query, ids = select(shards.c.id, *_OUTCOME), [row["shard_id"] for row in rows]
-        known = {shard: _outcome(*made) for shard, *made in rows_in(connection, query, shards.c.id, ids)}
+        known = {shard: _finished_task_columns(*made) for shard, *made in rows_in(connection, query, shards.c.id, ids)}
         for row in rows:
             row.update(known.get(row["shard_id"], {}))
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "priority"])
 
-    def _enter(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
+    def _enter_ranges(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
         """Add up to `RANGES_AT_ONCE` ranges from `first`; with `goes_on`, note the next range, if any."""
         number = count_ranges(record.request.grasps, record.span)
         some = range(first, min(number, first + RANGES_AT_ONCE))
@@ -406,7 +406,7 @@ class Changes(IndexPart):
 _OUTCOME = (shards.c.worker, shards.c.device, shards.c.seconds, shards.c.created)
 
 
-def _outcome(worker: Any, device: Any, seconds: Any, created: Any) -> dict[str, Any]:
+def _finished_task_columns(worker: Any, device: Any, seconds: Any, created: Any) -> dict[str, Any]:
     """Return the columns of a task row that follow from its shard, given as values or as SQL columns."""
     made = {"done": True, "worker": worker, "device": device, "seconds": seconds, "finished": created}
     return {**made, "reason": None, "queued": False, "not_before": 0.0, **NO_PROGRESS}
@@ -473,7 +473,7 @@ class DatasetChanges(IndexPart):
 _UNFINISHED = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
 
 
-class Live(IndexPart):
+class LiveChanges(IndexPart):
     def set_running(self, workers: Mapping[str, str]) -> dict[str, State]:
         """Mark queued tasks as running; `workers` maps tasks to workers. Return the states of their jobs."""
         running = State.RUNNING.value
@@ -525,7 +525,7 @@ class Live(IndexPart):
         with self.database.write_transaction() as connection:
             connection.execute(update(assets).where(assets.c.digest.in_(list(digests))).values(**values))
 
-    def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
+    def set_workers(self, beats: Sequence[WorkerHeartbeat], *, forget_before: str, lost_before: str = "9999") -> None:
         """Record living workers; mark others as lost or delete them, according to their last report."""
         rows = [
             row_from(workers, beat, stages=[stage.value for stage in beat.stages], task_id=beat.task_id or None)
@@ -540,9 +540,9 @@ class Live(IndexPart):
             for some in chunks(lost):
                 of_lost = update(workers).where(workers.c.name.in_(some))
                 connection.execute(of_lost.values(state="lost", task_id=None, reason=""))
-            self.forget_workers([row.name for row in gone if row.seen < forget_before], within=connection)
+            self.delete_workers([row.name for row in gone if row.seen < forget_before], within=connection)
 
-    def forget_workers(self, names: Sequence[str], *, within: Connection | None = None) -> None:
+    def delete_workers(self, names: Sequence[str], *, within: Connection | None = None) -> None:
         with self.database.write_transaction(within) as connection:
             for some in chunks(names):
                 connection.execute(delete(workers).where(workers.c.name.in_(some)))

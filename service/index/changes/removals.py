@@ -100,13 +100,13 @@ class Removals(IndexPart):
         """Remove a shard with its grasps unless a task produces it; return whether its files can be deleted."""
         if within.scalar(select(tasks.c.id).where(tasks.c.shard_id == shard).limit(1)) is not None:
             return False
-        _remember_cost(shard, within)
+        _record_cost(shard, within)
         within.execute(delete(grasps).where(grasps.c.shard_id == shard))
         within.execute(delete(shards).where(shards.c.id == shard))
         return True
 
 
-def _remember_cost(shard: str, connection: Connection) -> None:
+def _record_cost(shard: str, connection: Connection) -> None:
     """Add the cost of a shard to table `spent`; deleted results count as usage."""
     row = connection.execute(select(shards).where(shards.c.id == shard)).mappings().first()
     if row is None:

@@ -73,7 +73,7 @@ def _not_refused() -> ColumnElement[bool]:
 
 
 class ObjectSets(IndexPart):
-    def newest(self, *, scope: ProjectScope = EVERYTHING) -> list[ObjectSetView]:
+    def newest_versions(self, *, scope: ProjectScope = EVERYTHING) -> list[ObjectSetView]:
         query = select(object_sets).where(*scope_conditions(scope, object_sets))
         query = query.order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
         return list({row["name"]: ObjectSetView(**row) for row in self.database.rows(query)}.values())
@@ -85,7 +85,7 @@ class ObjectSets(IndexPart):
         return ObjectSetView(**rows[0]) if rows else None
 
     def get(self, name: str, *, scope: ProjectScope = EVERYTHING) -> ObjectSetView:
-        found = {view.name: view for view in self.newest(scope=scope)}
+        found = {view.name: view for view in self.newest_versions(scope=scope)}
         if name not in found:
             raise NotFoundError(f"there is no set of objects {name!r}{available_names(name, list(found)[:SEARCHED])}")
         return found[name]

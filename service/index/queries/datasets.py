@@ -43,11 +43,17 @@ class Datasets(IndexPart):
         query = select(datasets).where(datasets.c.name.in_(sorted(names)))
         with self.database.read_transaction() as connection:
             rows = connection.execute(query).mappings().all()
-            return {row["name"] for row in rows if not _state(row, _states(connection, row)).is_final}
+            return {
+                row["name"] for row in rows if not _dataset_state(row, _cell_counts_by_state(connection, row)).is_final
+            }
 
     def ended_event_counts(self, *, within: Connection) -> dict[str, int]:
         rows = self.database.rows(select(datasets), within)
-        return {row["name"]: row["events"] for row in rows if _state(row, _states(within, row)).is_final}
+        return {
+            row["name"]: row["events"]
+            for row in rows
+            if _dataset_state(row, _cell_counts_by_state(within, row)).is_final
+        }
 
     def cells(
         self,
@@ -111,8 +117,8 @@ def _cell_state(cancelled: bool) -> ColumnElement[str]:
 
 def _dataset_view(connection: Connection, row: Any) -> DatasetView:
     options = JobOptions.model_validate(row["options"])
-    states = _states(connection, row)
-    state = _state(row, states)
+    states = _cell_counts_by_state(connection, row)
+    state = _dataset_state(row, states)
     work = _task_counts(connection, dataset_cells.c.dataset == row["name"])
     made = _grasp_counts(connection, dataset_cells.c.dataset == row["name"])
     tasks_asked = max(work["tasks"], _count_tasks_of_dataset(connection, row["name"], options))
@@ -136,7 +142,7 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
     )
 
 
-def _state(row: Any, states: dict[State, int]) -> State:
+def _dataset_state(row: Any, states: dict[State, int]) -> State:
     state = job_state(state for state, count in states.items() if count)
     if row["cancelled"]:
         # Jobs of a cancelled dataset stop, or continue for another dataset.
@@ -145,7 +151,7 @@ def _state(row: Any, states: dict[State, int]) -> State:
     return State.QUEUED if state.is_final and row["applied"] < row["events"] else state
 
 
-def _states(connection: Connection, row: Any) -> dict[State, int]:
+def _cell_counts_by_state(connection: Connection, row: Any) -> dict[State, int]:
     now = _cell_state(row["cancelled"])
     query = select(now, func.count()).select_from(dataset_cells).where(dataset_cells.c.dataset == row["name"])
     query = query.outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id).group_by(now)
@@ -196,16 +202,18 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
         count = work[job]
         total = max(count["tasks"], _count_tasks_of_cell(options, row["span"]))
         yields = made.get(job, {"seconds": 0.0})
-        found = yields.get("valid" if options.counted == "valid" else "grasps", 0)
+        found = yields.get("valid" if options.counted_status == "valid" else "grasps", 0)
         reason = row["reason"]
         if row["state"] == State.SUCCEEDED.value and options.want == "valid" and found < options.grasps:
             rejected, candidates = outcomes_of(connection, tasks.c.job_id == job), yields.get("candidates", 0)
-            reason = explain_shortfall(found, options.grasps, options.counted, candidates, options.budget, rejected)
+            reason = explain_shortfall(
+                found, options.grasps, options.counted_status, candidates, options.budget, rejected
+            )
         views.append(
             CellView(
                 **{name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "choice")},
                 reason=reason,
-                fidelity=row["fidelity"] or options.knobs.name,
+                fidelity=row["fidelity"] or options.resolved_fidelity.name,
                 asked=options.grasps,
                 **yields,
                 tasks=total,

@@ -13,7 +13,7 @@ from graspd.service.index.database import IndexPart
 from graspd.service.index.tables import assets, dataset_cells, datasets, jobs, tasks
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.planning import MAX_BACKOFF_S, PlannedTask, RoundRobin, WaitingJob, interleave, queue_owner
-from graspd.service.model.records import Cell, Choice, JobRecord, Member
+from graspd.service.model.records import Cell, DatasetMember, FidelityChoice, JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 
 
@@ -42,7 +42,7 @@ class Feed(IndexPart):
     def waiting_jobs(self, priority: Priority, *, now: float) -> list[WaitingJob]:
         """Return the jobs with a task to queue at `now` [Unix time, s], the oldest first."""
         unfinished = jobs.c.state.in_((State.QUEUED.value, State.RUNNING.value))
-        waiting = exists().where(tasks.c.job_id == jobs.c.id, *_WAITING, _due(tasks.c.not_before, now))
+        waiting = exists().where(tasks.c.job_id == jobs.c.id, *_WAITING, _due_condition(tasks.c.not_before, now))
         query = select(jobs.c.id, jobs.c.origin, jobs.c.project).order_by(jobs.c.created, jobs.c.id)
         rows = self.database.rows(query.where(unfinished, jobs.c.priority == priority.value, waiting))
         keys = [(row["origin"] or {}).get("key", "") for row in rows]
@@ -51,7 +51,7 @@ class Feed(IndexPart):
     def ready_tasks(self, priority: Priority, turns: RoundRobin, *, now: float, limit: int) -> list[ReadyTask]:
         """Return at most `limit` tasks to queue, round-robin over projects or keys, then over their jobs."""
         of_key: dict[str, list[list[tuple[WaitingJob, ReadyTask]]]] = defaultdict(list)
-        for job, share in turns.order(self.waiting_jobs(priority, now=now), limit):
+        for job, share in turns.next_jobs(self.waiting_jobs(priority, now=now), limit):
             of_key[job.key].append([(job, task) for task in self.ready_tasks_of_job(job.id, limit=share, now=now)])
         chosen = interleave([interleave(of_jobs) for of_jobs in of_key.values()])[:limit]
         turns.record_served([job for job, _ in chosen])
@@ -59,7 +59,7 @@ class Feed(IndexPart):
 
     def ready_tasks_of_job(self, job_id: str, *, limit: int, now: float | None = None) -> list[ReadyTask]:
         """Return the first tasks of a job to queue; without `now`, back-offs are ignored."""
-        due = () if now is None else (_due(tasks.c.not_before, now),)
+        due = () if now is None else (_due_condition(tasks.c.not_before, now),)
         query = select(tasks, *(jobs.c[name] for name in _OF_THE_JOB)).join(jobs, jobs.c.id == tasks.c.job_id)
         query = query.where(tasks.c.job_id == job_id, *_WAITING, *due).order_by(tasks.c.batch)
         rows = self.database.rows(query.limit(limit))
@@ -67,7 +67,7 @@ class Feed(IndexPart):
         return [_ready_task(row, record) for row in rows if record is not None]
 
     def ready_checks(self, *, now: float, limit: int) -> list[ReadyCheck]:
-        open_ = (assets.c.verdict.is_(None), assets.c.queued.is_(False), _due(assets.c.not_before, now))
+        open_ = (assets.c.verdict.is_(None), assets.c.queued.is_(False), _due_condition(assets.c.not_before, now))
         query = select(assets).where(*open_).order_by(assets.c.created).limit(limit)
         return [
             ReadyCheck(AssetKind(row["kind"]), row["name"], row["digest"], row["last_attempt"])
@@ -87,7 +87,7 @@ class Feed(IndexPart):
         query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id)
         return {task: (stage, shard) for task, stage, shard in self.database.matching_rows(query, tasks.c.id, task_ids)}
 
-    def cancelled(self, task_ids: Collection[str]) -> set[str]:
+    def cancelled_tasks(self, task_ids: Collection[str]) -> set[str]:
         query = select(tasks.c.id).where(tasks.c.state == State.CANCELLED.value)
         return {row.id for row in self.database.matching_rows(query, tasks.c.id, task_ids)}
 
@@ -106,7 +106,7 @@ _OF_THE_JOB = ("request", "revisions", "span", "origin", "hand_digest", "object_
 _WAITING = (tasks.c.ready.is_(True), tasks.c.queued.is_(False))
 
 
-def _due(not_before: Column[float], now: float) -> ColumnElement[bool]:
+def _due_condition(not_before: Column[float], now: float) -> ColumnElement[bool]:
     # A due time further away than any back-off means that the clock was set back: the task is due at once.
     return or_(not_before <= now, not_before > now + 2 * MAX_BACKOFF_S)
 
@@ -152,11 +152,11 @@ class DatasetFeed(IndexPart):
         return [
             Cell(
                 row["position"],
-                Member(name=row["hand"], digest=row["hand_digest"]),
-                Member(name=row["object"], digest=row["object_digest"]),
+                DatasetMember(name=row["hand"], digest=row["hand_digest"]),
+                DatasetMember(name=row["object"], digest=row["object_digest"]),
                 row["job_id"],
                 row["fidelity"] or "",
-                row["choice"] and Choice.model_validate(row["choice"]),
+                row["choice"] and FidelityChoice.model_validate(row["choice"]),
             )
             for row in self.database.rows(query)
         ]

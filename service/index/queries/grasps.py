@@ -72,9 +72,9 @@ class Grasps(IndexPart):
     def get(self, shard_id: str, row: int, *, scope: ProjectScope = EVERYTHING) -> GraspView:
         query = select(grasps).where(grasps.c.shard_id == shard_id, grasps.c.row == row)
         query = query.where(*shard_scope_conditions(scope, grasps.c.shard_id))
-        return GraspView(**self.database.one(query, f"grasp {row} in shard {shard_id!r}"))
+        return GraspView(**self.database.first_row(query, f"grasp {row} in shard {shard_id!r}"))
 
-    def members(self, where: GraspFilter, *, limit: int) -> list[Grasp]:
+    def matching_grasps(self, where: GraspFilter, *, limit: int) -> list[Grasp]:
         query = select(grasps.c.shard_id, grasps.c.row).order_by(grasps.c.shard_id, grasps.c.row).limit(limit)
         return [(found["shard_id"], found["row"]) for found in self.database.rows(query.where(*sql_conditions(where)))]
 
@@ -112,7 +112,7 @@ _FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
 
 
 @dataclass(frozen=True)
-class Condition:
+class ColumnCondition:
     """Comparison of one column with a value. Conditions of one group share one database index."""
 
     group: str
@@ -122,31 +122,31 @@ class Condition:
 
     def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
         """Return the test in SQL, which uses an index only if its group is in `groups` (None: all groups)."""
-        return self._of(self.column if groups is None or self.group in groups else _without_index(self.column))
+        return self._compare(self.column if groups is None or self.group in groups else _without_index(self.column))
 
     def sql_for_rows(self, rows: Subquery) -> ColumnElement[bool]:
-        return self._of(rows.c[str(self.column.key)])
+        return self._compare(rows.c[str(self.column.key)])
 
-    def _of(self, column: ColumnElement[Any]) -> ColumnElement[bool]:
+    def _compare(self, column: ColumnElement[Any]) -> ColumnElement[bool]:
         test: ColumnElement[bool] = self.operator(column, self.value)
         return test
 
 
 @dataclass(frozen=True)
-class Tagged:
+class TagCondition:
     tag: str
     group: str = "tag"
 
     def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
         if groups is not None and self.group not in groups:
-            return self._of(grasps.c)
+            return self._membership(grasps.c)
         those = select(tagged.c.shard_id, tagged.c.row).where(tagged.c.tag == self.tag)
         return tuple_(grasps.c.shard_id, grasps.c.row).in_(those)
 
     def sql_for_rows(self, rows: Subquery) -> ColumnElement[bool]:
-        return self._of(rows.c)
+        return self._membership(rows.c)
 
-    def _of(self, columns: Any) -> ColumnElement[bool]:
+    def _membership(self, columns: Any) -> ColumnElement[bool]:
         same = (tagged.c.tag == self.tag, tagged.c.shard_id == columns.shard_id, tagged.c.row == columns.row)
         return select(tagged.c.tag).where(*same).exists()
 
@@ -165,7 +165,7 @@ class ExpressionCondition:
         return sql_condition(self.node, rows.c)
 
 
-Test = Condition | Tagged | ExpressionCondition
+Test = ColumnCondition | TagCondition | ExpressionCondition
 
 
 def conditions(where: GraspFilter | None) -> list[Test]:
@@ -174,35 +174,35 @@ def conditions(where: GraspFilter | None) -> list[Test]:
     found: list[Test] = []
     if where.job is not None:
         of_job = (tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value)
-        found.append(Condition("job", grasps.c.shard_id, in_op, select(tasks.c.shard_id).where(*of_job)))
+        found.append(ColumnCondition("job", grasps.c.shard_id, in_op, select(tasks.c.shard_id).where(*of_job)))
     if where.dataset is not None:
         made = _tasks_of_dataset(where.dataset).with_only_columns(tasks.c.shard_id)
-        found.append(Condition("dataset", grasps.c.shard_id, in_op, made))
+        found.append(ColumnCondition("dataset", grasps.c.shard_id, in_op, made))
     if where.tag is not None:
-        found.append(Tagged(where.tag))
+        found.append(TagCondition(where.tag))
     if where.where is not None:
         found.append(ExpressionCondition(parse_where(where.where)))
     if where.project is not None:
         made = _tasks_of_project(where.project).with_only_columns(tasks.c.shard_id)
-        found.append(Condition("project", grasps.c.shard_id, in_op, made))
+        found.append(ColumnCondition("project", grasps.c.shard_id, in_op, made))
     for name, wanted in (("hand", where.hand), ("object", where.object)):
         if wanted is not None:
-            found.append(Condition("pair", grasps.c[name], operator.eq, wanted))
+            found.append(ColumnCondition("pair", grasps.c[name], operator.eq, wanted))
     flags = {name: getattr(where, name) for name in ("valid", "success", "lift_hard")}
-    found += [Condition("flag", grasps.c[name], is_, flag) for name, flag in flags.items() if flag is not None]
+    found += [ColumnCondition("flag", grasps.c[name], is_, flag) for name, flag in flags.items() if flag is not None]
     # `valid=False` excludes grasps without validation.
     validated = True if where.valid is False else where.validated
     if validated is not None:
-        found.append(Condition("flag", grasps.c.success, operator.ne if validated else operator.eq, None))
+        found.append(ColumnCondition("flag", grasps.c.success, operator.ne if validated else operator.eq, None))
     if where.scene is not None:
         compared, kind = (operator.ne, "free") if where.scene == "any" else (operator.eq, where.scene)
-        found.append(Condition("flag", grasps.c.scene_kind, compared, kind))
+        found.append(ColumnCondition("flag", grasps.c.scene_kind, compared, kind))
     if where.robust_weakest is not None:
-        found.append(Condition("flag", grasps.c.robust_weakest, operator.eq, where.robust_weakest))
+        found.append(ColumnCondition("flag", grasps.c.robust_weakest, operator.eq, where.robust_weakest))
     if where.neighbours is not None:
-        found.append(Condition("flag", grasps.c.neighbours, operator.gt if where.neighbours else operator.eq, 0))
-    found += [Condition(name, grasps.c[name], operator.ge, bound) for name, bound in where.at_least.items()]
-    found += [Condition(name, grasps.c[name], operator.le, bound) for name, bound in where.at_most.items()]
+        found.append(ColumnCondition("flag", grasps.c.neighbours, operator.gt if where.neighbours else operator.eq, 0))
+    found += [ColumnCondition(name, grasps.c[name], operator.ge, bound) for name, bound in where.at_least.items()]
+    found += [ColumnCondition(name, grasps.c[name], operator.le, bound) for name, bound in where.at_most.items()]
     return found
 
 
@@ -217,7 +217,7 @@ def search(connection: Connection, where: GraspFilter | None, sort: GraspSort, s
     rows: list[Any] = []
     # Databases sort NULL differently, so rows with and without the metric need two queries.
     if start is None or start[0] is not None:
-        rows = _with_metric(connection, wanted, few, sort, size, start)
+        rows = _rows_with_metric(connection, wanted, few, sort, size, start)
     if len(rows) < size:
         by = grasps.c[sort.by]
         query = select(grasps).where(by.is_(None), *(c.sql([few] if few else None) for c in wanted))
@@ -227,7 +227,7 @@ def search(connection: Connection, where: GraspFilter | None, sort: GraspSort, s
     return rows
 
 
-def _with_metric(
+def _rows_with_metric(
     connection: Connection, wanted: Sequence[Test], few: str | None, sort: GraspSort, size: int, start: Start
 ) -> list[Any]:
     by = grasps.c[sort.by]
@@ -246,7 +246,7 @@ def _with_metric(
         query = select(looked).where(*(c.sql_for_rows(looked) for c in outside))
         looked_key = tuple(looked.c[str(column.key)] for column in key)
         rows = list(connection.execute(_slice(query, looked_key, sort, size, None)).mappings())
-        if len(rows) >= size or _count(connection, looked) < number:
+        if len(rows) >= size or _count_rows(connection, looked) < number:
             return rows
     # PostgreSQL combines indexes; SQLite would follow a single one row by row, which is slower than a full scan.
     groups: list[str] | None = None if connection.dialect.name == "postgresql" else []
@@ -290,7 +290,7 @@ def estimate_row_count(connection: Connection, where: GraspFilter, group: str, w
         query = select(func.sum(shards.c.count)).where(shards.c.kind == "base", *tests)
     else:
         some = select(grasps.c[group]).where(*(c.sql(None) for c in wanted if c.group == group))
-        return _count(connection, some.limit(SORTED_AT_ONCE + 1).subquery())
+        return _count_rows(connection, some.limit(SORTED_AT_ONCE + 1).subquery())
     return int(connection.scalar(query) or 0)
 
 
@@ -304,7 +304,7 @@ def _tasks_of_dataset(dataset: str) -> Select[Any]:
     return joined.where(dataset_cells.c.dataset == dataset, tasks.c.stage == Stage.SYNTHESIZE.value)
 
 
-def _count(connection: Connection, rows: Subquery) -> int:
+def _count_rows(connection: Connection, rows: Subquery) -> int:
     return int(connection.scalar(select(func.count()).select_from(rows)) or 0)
 
 

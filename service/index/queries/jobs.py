@@ -53,7 +53,7 @@ class Jobs(IndexPart):
     def get(self, job_id: str, *, scope: ProjectScope = EVERYTHING) -> JobView:
         with self.database.read_transaction() as connection:
             query = select(jobs).where(jobs.c.id == job_id, *scope_conditions(scope, jobs))
-            (view,) = _job_views(connection, [self.database.one(query, f"job {job_id!r}", connection)])
+            (view,) = _job_views(connection, [self.database.first_row(query, f"job {job_id!r}", connection)])
             if view.note is None:
                 return view
             return view.model_copy(update={"outcomes": outcomes_of(connection, tasks.c.job_id == job_id)})
@@ -71,9 +71,9 @@ class Jobs(IndexPart):
 
     def task(self, task_id: str, *, scope: ProjectScope = EVERYTHING) -> TaskView:
         query = select(tasks).where(tasks.c.id == task_id, *scope_conditions_by_job(scope, tasks))
-        return _task_view(self.database.one(query, f"task {task_id!r}"))
+        return _task_view(self.database.first_row(query, f"task {task_id!r}"))
 
-    def out_of_scope(self, task_ids: Collection[str], scope: ProjectScope) -> set[str]:
+    def tasks_out_of_scope(self, task_ids: Collection[str], scope: ProjectScope) -> set[str]:
         query = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id).where(jobs.c.project != scope.project)
         return {row.id for row in self.database.matching_rows(query, tasks.c.id, task_ids)}
 
@@ -89,7 +89,7 @@ def _equality_conditions(wanted: Mapping[Column[Any], str | None]) -> list[Colum
 
 def _job_views(connection: Connection, rows: Sequence[Any]) -> list[JobView]:
     ids = [row["id"] for row in rows]
-    progress = _progress(connection, ids)
+    progress = _stage_progress_by_job(connection, ids)
     made = _grasp_counts(connection, ids)
     views = []
     for row in rows:
@@ -105,7 +105,7 @@ def _with_pending_tasks(stage: StageProgress, tasks: int) -> StageProgress:
     return stage.model_copy(update={"tasks": stage.tasks + more, "queued": stage.queued + more}) if more else stage
 
 
-def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[StageProgress]]:
+def _stage_progress_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, list[StageProgress]]:
     # The shard of a task is reused if it is older than the task; both times are texts of one format.
     reused = and_(tasks.c.done, tasks.c.finished < tasks.c.created)
     group = (tasks.c.job_id, tasks.c.position, tasks.c.stage, tasks.c.state)
@@ -186,4 +186,4 @@ class Shards(IndexPart):
 
     def get(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> ShardView:
         query = select(shards).where(shards.c.id == shard_id, *shard_scope_conditions(scope, shards.c.id))
-        return ShardView(**self.database.one(query, f"shard {shard_id!r}"))
+        return ShardView(**self.database.first_row(query, f"shard {shard_id!r}"))

@@ -125,7 +125,7 @@ class IndexStatus:
     """Number of stored objects with known damage, at most `MOST_JOBS`."""
 
 
-def read_index(database: Database) -> IndexStatus:
+def read_index_status(database: Database) -> IndexStatus:
     """Return the status of an index for the metrics."""
     counted, oldest = {}, {}
     with database.read_transaction() as connection:
@@ -213,11 +213,11 @@ class BatchCost:
     @property
     def counted_grasps(self) -> int:
         """Grasps that count towards the request: valid ones, or all stored ones if validation is off."""
-        return self.valid if self.request.counted == "valid" else self.count
+        return self.valid if self.request.counted_status == "valid" else self.count
 
 
 class Costs(IndexPart):
-    def of_batches(self, stage: Stage, *, limit: int = _NEWEST, scope: ProjectScope = EVERYTHING) -> list[BatchCost]:
+    def batch_costs(self, stage: Stage, *, limit: int = _NEWEST, scope: ProjectScope = EVERYTHING) -> list[BatchCost]:
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
         query = select(*columns, shards.c.manifest["request"].label("request"))
         query = query.where(shards.c.kind == SHARD_KINDS[stage], *shard_scope_conditions(scope, shards.c.id))

@@ -101,16 +101,16 @@ class Rates:
         """Group the `synthesize` batches of these options and devices (empty: all) by hand and object."""
         self._options = options
         self._groups: dict[Hashable, list[BatchCost]] = defaultdict(list)
-        recipe = recipe_of(options)
+        recipe = cost_options(options)
         here = [batch for batch in batches if batch.candidates and (not devices or batch.device in devices)]
-        self.machine = machine_of(here)
+        self.machine = measure_machine(here)
         for batch in here:
-            if recipe_of(batch.request) == recipe:
+            if cost_options(batch.request) == recipe:
                 for key in ((batch.hand, batch.object), batch.hand, ()):
                     self._groups[key].append(batch)
         self._known: dict[Hashable, Rate] = {}
 
-    def of(self, hand: str, obj: str) -> Rate:
+    def rate_for(self, hand: str, obj: str) -> Rate:
         """Return the rate of the nearest measurement, else the stored rate."""
         levels: tuple[tuple[Hashable, str], ...] = (
             ((hand, obj), f"{hand} on {obj}"),
@@ -133,7 +133,7 @@ class Rates:
                 bytes_per_grasp=sum(b.size_bytes for b in batches) / max(1, sum(b.count for b in batches)),
                 origin=f"measured here: {words}, {devices}",
                 batches=len(batches),
-                spread=_spread([batch.seconds / batch.candidates for batch in batches], MEASURED_SPREAD),
+                spread=_relative_deciles([batch.seconds / batch.candidates for batch in batches], MEASURED_SPREAD),
             )
         return self._known[key]
 
@@ -153,16 +153,20 @@ def expected_candidates(rate: Rate, options: JobOptions) -> float:
 
 def _stored_rates(options: JobOptions) -> tuple[float, float, str]:
     """Return stored seconds per candidate, yield and origin."""
-    if options.models:
+    if options.model_count:
         plain = options.model_copy(update={"robust": 0.0, "robust_models": 0})
         seconds, share, origin = _stored_rates(plain)
-        return seconds + share * options.models * STORED_MODEL_S, share, f"{origin}, and {options.models} models"
+        return (
+            seconds + share * options.model_count * STORED_MODEL_S,
+            share,
+            f"{origin}, and {options.model_count} models",
+        )
     if options.in_scene:
         free = {"scene": "free", "faces": "drawn", "touch": TOUCH, "neighbours": ()}
         seconds, _, origin = _stored_rates(options.model_copy(update=free))
         longer, share = STORED_IN_SCENE
         return longer * seconds, share, f"{origin}, in a scene"
-    method, name = options.method, options.knobs.name
+    method, name = options.method, options.resolved_fidelity.name
     if method in STORED_METHODS:
         return *STORED_METHODS[method], f"{ORIGIN}, {method}"
     origin = ORIGIN if name in STORED else f"{ORIGIN}, value of standard (none for {name})"
@@ -171,9 +175,9 @@ def _stored_rates(options: JobOptions) -> tuple[float, float, str]:
     return *STORED.get(name, STORED["standard"]), origin
 
 
-def machine_of(batches: Iterable[BatchCost]) -> Machine:
+def measure_machine(batches: Iterable[BatchCost]) -> Machine:
     """Compare the seconds of `synthesize` batches with the stored seconds of the same options."""
-    comparable = [batch for batch in batches if batch.candidates and _is_stored(batch.request)]
+    comparable = [batch for batch in batches if batch.candidates and _has_stored_rate(batch.request)]
     ratios = [
         batch.seconds / batch.candidates / _stored_rates(batch.request)[0]
         for batch in _large_batches(comparable)
@@ -181,16 +185,18 @@ def machine_of(batches: Iterable[BatchCost]) -> Machine:
     ]
     if not ratios:
         return Machine()
-    return Machine(median(ratios), _spread(ratios, (1.0, 1.0)), len(ratios))
+    return Machine(median(ratios), _relative_deciles(ratios, (1.0, 1.0)), len(ratios))
 
 
-def _is_stored(request: JobOptions) -> bool:
-    if request.options or request.in_scene or request.models:
+def _has_stored_rate(request: JobOptions) -> bool:
+    if request.options or request.in_scene or request.model_count:
         return False
-    return request.method in STORED_METHODS or (request.method == "fast_graspd" and request.knobs.name in STORED)
+    return request.method in STORED_METHODS or (
+        request.method == "fast_graspd" and request.resolved_fidelity.name in STORED
+    )
 
 
-def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, float]:
+def _relative_deciles(values: list[float], least: tuple[float, float]) -> tuple[float, float]:
     """Return the first and last decile of the values, divided by the median; at least as wide as `least`."""
     if len(values) < 2 or (middle := median(values)) <= 0:
         return least
@@ -203,17 +209,17 @@ def _large_batches(batches: list[BatchCost]) -> list[BatchCost]:
     return [batch for batch in batches if 2 * batch.candidates >= BATCH_SIZE] or batches
 
 
-def recipe_of(options: JobOptions) -> Hashable:
+def cost_options(options: JobOptions) -> Hashable:
     """Return the options that decide the cost of a grasp on a given hand, object and device."""
     return (
         options.method,
         tuple(sorted((name, str(value)) for name, value in options.options.items())),
-        options.knobs.model_dump_json(exclude={"name"}),
+        options.resolved_fidelity.model_dump_json(exclude={"name"}),
         options.want,
         options.validation,
-        (options.models, options.robust),
-        options.place.kind,
-        len(options.beside),
+        (options.model_count, options.robust),
+        options.scene_spec.kind,
+        len(options.all_neighbours),
     )
 
 
@@ -230,7 +236,7 @@ def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machi
         return _rate_on_machine(machine, STORED_PLACE if options.in_scene else STORED_SCENE)
     scenes = sum(batch.batches * batch.request.scenes for batch in found)
     seconds = sum(batch.seconds for batch in found) / scenes
-    spread = _spread([one.seconds / (one.batches * one.request.scenes) for one in found], MEASURED_SPREAD)
+    spread = _relative_deciles([one.seconds / (one.batches * one.request.scenes) for one in found], MEASURED_SPREAD)
     return StageRate(seconds, sum(b.size_bytes for b in found) / rows, "measured here", len(found), spread)
 
 
@@ -244,4 +250,4 @@ def picture_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Mac
     seconds = sum(batch.seconds for batch in found) / megapixels
     each = [batch.seconds / number for batch, number in zip(found, pixels, strict=True)]
     sizes = sum(batch.size_bytes for batch in found) / megapixels
-    return StageRate(seconds, sizes, "measured here", len(found), _spread(each, MEASURED_SPREAD))
+    return StageRate(seconds, sizes, "measured here", len(found), _relative_deciles(each, MEASURED_SPREAD))

@@ -75,7 +75,7 @@ class Statistics(IndexPart):
 
         It covers a fair sample of about `at_most` grasps per filter: shards whose id, a digest, is below a bound.
         """
-        samples = [self._values(where, metrics, at_most) for where in filters]
+        samples = [self._sampled_values(where, metrics, at_most) for where in filters]
         found: dict[Metric, list[Distribution | None]] = {}
         for at, metric in enumerate(metrics):
             columns = [values[:, at] for values in samples]
@@ -85,9 +85,11 @@ class Statistics(IndexPart):
                 found[metric] = [_distribution(column, bins, ends) for column in columns]
         return found
 
-    def _values(self, where: GraspFilter, metrics: Sequence[Metric], at_most: int) -> NDArray[np.float64]:
+    def _sampled_values(self, where: GraspFilter, metrics: Sequence[Metric], at_most: int) -> NDArray[np.float64]:
         with self.database.read_transaction() as connection:
-            query = select(*(grasps.c[metric] for metric in metrics)).where(*_sample(connection, where, at_most))
+            query = select(*(grasps.c[metric] for metric in metrics)).where(
+                *_sample_conditions(connection, where, at_most)
+            )
             rows = [tuple(row) for row in connection.execute(query)]
         return np.array(rows, float).reshape(-1, len(metrics))
 
@@ -95,7 +97,9 @@ class Statistics(IndexPart):
         """Count types and approach cells of about `at_most` grasps, sampled as in `compare_distributions`."""
         columns = grasps.c.grasp_type, grasps.c.approach_cell
         with self.database.read_transaction() as connection:
-            query = select(*columns, func.count()).where(*_sample(connection, where, at_most)).group_by(*columns)
+            query = (
+                select(*columns, func.count()).where(*_sample_conditions(connection, where, at_most)).group_by(*columns)
+            )
             rows = connection.execute(query).all()
         found = GraspKinds({}, {})
         for kind, cell, count in rows:
@@ -105,7 +109,7 @@ class Statistics(IndexPart):
         return found
 
 
-def _sample(connection: Connection, where: GraspFilter, at_most: int) -> list[ColumnElement[bool]]:
+def _sample_conditions(connection: Connection, where: GraspFilter, at_most: int) -> list[ColumnElement[bool]]:
     """Return the conditions of a filter, restricted to a share of the shards with about `at_most` grasps."""
     group = "job" if where.job is not None else "dataset" if where.dataset is not None else "pair"
     share = min(1.0, at_most / max(1, estimate_row_count(connection, where, group)))

@@ -22,15 +22,28 @@ from graspd.service.model.digests import digest_json
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.projects import EVERYTHING, ProjectScope
-from graspd.service.model.records import DatasetRecord, Member, ObjectSet, Snapshot, job_of, object_set_of
+from graspd.service.model.records import (
+    DatasetMember,
+    DatasetRecord,
+    ObjectSet,
+    Snapshot,
+    create_job_record,
+    create_object_set,
+)
 from graspd.service.model.scene_spec import NamedNeighbour, SceneDocument
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services, record_transaction
-from graspd.service.pipeline.datasets.cost import objects_of
+from graspd.service.pipeline.datasets.cost import expand_objects
 from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix, create_record
-from graspd.service.pipeline.fidelity_choice import Resolver
-from graspd.service.pipeline.job_actions import TaskRanges, refuse_deleted, usable_asset, with_neighbours, with_network
+from graspd.service.pipeline.fidelity_choice import FidelityResolver
+from graspd.service.pipeline.job_actions import (
+    TaskRanges,
+    refuse_deleted,
+    resolve_neighbours,
+    resolve_network,
+    usable_asset,
+)
 from graspd.service.store.records import (
     Put,
     add_dataset_event,
@@ -61,14 +74,14 @@ def create(
         ConflictError: a check is still running, or another dataset has the name.
         LimitError: more than `MAX_CELLS` cells.
     """
-    hands, objects = members(services, request, scope)
-    shared, beside = with_neighbours(services, request.shared, scope)
-    shared = with_network(services, shared, hands, scope)
+    hands, objects = resolve_members(services, request, scope)
+    shared, beside = resolve_neighbours(services, request.cell_options, scope)
+    shared = resolve_network(services, shared, hands, scope)
     services.queue.ping()
     key = names.dataset_record_key(request.name)
     found = None
     if not services.store.exists(key):  # A newer chart must not change the fidelities of an existing dataset.
-        choose = Resolver(services.store).choose
+        choose = FidelityResolver(services.store).choose
         found = create_record(request.name, hands, objects, shared, choose, owner, scope.project)
     wanted = [(AssetKind.HAND, one.digest) for one in hands]
     wanted += [(AssetKind.OBJECT, one.digest) for one in objects]
@@ -81,7 +94,7 @@ def create(
             # Names are unique in the whole service. The message reveals nothing else of the other project.
             raise ConflictError(f"the name {record.name!r} is taken; take another name")
         # Options are compared instead of digests, because older records lack newer options.
-        if not new and (other := _difference(record, hands, objects, shared)):
+        if not new and (other := _describe_difference(record, hands, objects, shared)):
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
         refuse_pending_deletion(services.store, "dataset", record.name)
         refuse_deleted(services, wanted, connection)
@@ -172,7 +185,7 @@ def add_object_set(
             owner, project = known.owner, known.project
             may_follow(owner, project)
         refuse_deleted(services, [(AssetKind.OBJECT, one.digest) for one in assets], connection)
-        found = object_set_of(name, wanted, after=after, owner=owner, project=project)
+        found = create_object_set(name, wanted, after=after, owner=owner, project=project)
         if not put(key := names.object_set_key(name, found.digest), found):
             # An earlier request was interrupted before it wrote the row.
             found = read_record(ObjectSet, services.store, key)
@@ -182,16 +195,20 @@ def add_object_set(
     return services.index.object_sets.get(name)
 
 
-def members(services: Services, matrix: Matrix, scope: ProjectScope = EVERYTHING) -> tuple[list[Member], list[Member]]:
+def resolve_members(
+    services: Services, matrix: Matrix, scope: ProjectScope = EVERYTHING
+) -> tuple[list[DatasetMember], list[DatasetMember]]:
     """Return names and digests of a matrix's hands and objects, sets included; errors as in `create`."""
-    objects = objects_of(services.index, matrix, scope)
-    hands = _members(services, AssetKind.HAND, matrix.hands, scope)
-    return hands, _members(services, AssetKind.OBJECT, objects, scope)
+    objects = expand_objects(services.index, matrix, scope)
+    hands = _usable_members(services, AssetKind.HAND, matrix.hands, scope)
+    return hands, _usable_members(services, AssetKind.OBJECT, objects, scope)
 
 
-def _members(services: Services, kind: AssetKind, wanted: Iterable[str], scope: ProjectScope) -> list[Member]:
+def _usable_members(
+    services: Services, kind: AssetKind, wanted: Iterable[str], scope: ProjectScope
+) -> list[DatasetMember]:
     assets = [usable_asset(services, kind, name, scope) for name in wanted]
-    return list(dict.fromkeys(Member(name=asset.name, digest=asset.digest) for asset in assets))
+    return list(dict.fromkeys(DatasetMember(name=asset.name, digest=asset.digest) for asset in assets))
 
 
 def _load_existing(services: Services, name: str) -> DatasetRecord:
@@ -208,7 +225,9 @@ def _add_event(
     services.index.write_dataset.set_events(name, dataset_events(services.store, name), within=connection)
 
 
-def _difference(known: DatasetRecord, hands: list[Member], objects: list[Member], options: JobOptions) -> str:
+def _describe_difference(
+    known: DatasetRecord, hands: list[DatasetMember], objects: list[DatasetMember], options: JobOptions
+) -> str:
     """Describe how an existing dataset differs from a request for the same name; empty if it does not."""
     words = []
     for what, ours, theirs in (("hands", hands, known.hands), ("objects", objects, known.objects)):
@@ -225,13 +244,13 @@ def _format_value(value: object) -> str:
     return "custom" if isinstance(value, SceneDocument) else repr(value)
 
 
-def _member_names(members: Iterable[Member]) -> str:
+def _member_names(members: Iterable[DatasetMember]) -> str:
     found = [member.name for member in members]
     more = f" and {len(found) - 5} more" if len(found) > 5 else ""
     return ", ".join(found[:5]) + more
 
 
-class DatasetRounds:
+class DatasetController:
     """Adds jobs of datasets and applies events of datasets to jobs, a part in each round."""
 
     def __init__(self, services: Services, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -255,7 +274,7 @@ class DatasetRounds:
             for cell in cells:
                 if self._clock() > deadline:
                     return False
-                job = job_of(cell, work.options, work.revisions, work.owner, work.project)
+                job = create_job_record(cell, work.options, work.revisions, work.owner, work.project)
                 job_actions.enter_job(self._services, self._ranges.with_span(job, among=len(cells)), keeps_assets=True)
                 after = cell.position
         self._services.index.write_dataset.set_progress(work.name, planned=True)

@@ -33,7 +33,7 @@ from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest
 from graspd.service.model.errors import LimitError
 from graspd.service.model.planning import stages_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
-from graspd.service.model.records import request_of
+from graspd.service.model.records import create_job_request
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.datasets.spec import MAX_CELLS, Estimate, Matrix, RateUsed, WorkersPlan
 
@@ -72,28 +72,28 @@ def estimate(
     `resolve` replaces the fidelity `auto`, or raises InputError. `costs` returns the finished batches of a stage (None:
     read from the index). `scope` limits sets of objects and measurements.
     """
-    objects = objects_of(index, matrix, scope)
-    options = matrix.shared
+    objects = expand_objects(index, matrix, scope)
+    options = matrix.cell_options
     devices = {worker.device for worker in index.overview.workers() if worker.state != "lost"}
-    costs = costs or partial(index.costs.of_batches, scope=scope)
+    costs = costs or partial(index.costs.batch_costs, scope=scope)
     batches = costs(Stage.SYNTHESIZE)
     rates: dict[str, Rates] = {}
     sums = _Sums()
     for hand in matrix.hands:
         for obj in objects:
-            chosen = resolve(request_of(options, hand, obj))
-            if chosen.knobs.name not in rates:
-                rates[chosen.knobs.name] = Rates(batches, chosen, devices)
-            sums.machine = rates[chosen.knobs.name].machine
-            _add_cell(sums, hand, rates[chosen.knobs.name].of(hand, obj), options)
+            chosen = resolve(create_job_request(options, hand, obj))
+            if chosen.resolved_fidelity.name not in rates:
+                rates[chosen.resolved_fidelity.name] = Rates(batches, chosen, devices)
+            sums.machine = rates[chosen.resolved_fidelity.name].machine
+            _add_cell(sums, hand, rates[chosen.resolved_fidelity.name].rate_for(hand, obj), options)
     scene = scene_rate(costs(Stage.SCENE) if options.scenes else [], options, sums.machine)
     picture = picture_rate(costs(Stage.RENDER) if options.views else [], options, sums.machine)
-    with_neighbours = list(dict.fromkeys([*objects, *(one.object for one in options.beside)]))
-    known = _assets(index, matrix.hands, with_neighbours, scope)
-    return _estimate(options, len(matrix.hands) * len(objects), sums, (scene, picture), known)
+    with_neighbours = list(dict.fromkeys([*objects, *(one.object for one in options.all_neighbours)]))
+    known = _asset_bytes(index, matrix.hands, with_neighbours, scope)
+    return _estimate_from_sums(options, len(matrix.hands) * len(objects), sums, (scene, picture), known)
 
 
-def objects_of(index: Index, matrix: Matrix, scope: ProjectScope) -> list[str]:
+def expand_objects(index: Index, matrix: Matrix, scope: ProjectScope) -> list[str]:
     """Return the objects of a matrix with sets expanded; LimitError for more than `MAX_CELLS` cells."""
     objects = dict.fromkeys(matrix.objects)
     for name in matrix.sets:
@@ -118,7 +118,7 @@ def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:
     sums.cells[hand, rate] += 1
 
 
-def _estimate(
+def _estimate_from_sums(
     options: JobOptions, cells: int, sums: _Sums, later: tuple[StageRate, StageRate], known: tuple[float, list[str]]
 ) -> Estimate:
     batches, stages = cells * -(-options.grasps // BATCH_SIZE), stages_of(options)
@@ -145,7 +145,7 @@ def _estimate(
         asked=cells * options.grasps,
         candidates=round(sums.candidates),
         valid=round(sums.valid),
-        counted=options.counted,
+        counted=options.counted_status,
         tasks=batches * len(stages),
         seconds=total,
         seconds_low=low,
@@ -184,7 +184,9 @@ def _plan(
     )
 
 
-def _assets(index: Index, hands: Sequence[str], objects: Sequence[str], scope: ProjectScope) -> tuple[float, list[str]]:
+def _asset_bytes(
+    index: Index, hands: Sequence[str], objects: Sequence[str], scope: ProjectScope
+) -> tuple[float, list[str]]:
     """Return the total size [bytes] of hands and objects over all cells, and the unknown names."""
     of_hands = index.assets.sizes(AssetKind.HAND, hands, scope=scope)
     of_objects = index.assets.sizes(AssetKind.OBJECT, objects, scope=scope)

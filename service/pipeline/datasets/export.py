@@ -23,12 +23,12 @@ def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Prog
 
     Files are `HAND/OBJECT/KIND-BATCH.h5`. DamagedShard: a checksum differs from that in the snapshot.
     """
-    _make(folder)
+    _make_folder(folder)
     fetched = size = 0
     for number, shard in enumerate(snapshot.shards, start=1):
         path = folder / path_of(shard)
         if not _is_exported(path, shard):
-            _make(path.parent)
+            _make_folder(path.parent)
             _fetch(shard, path, fetch)
             fetched, size = fetched + 1, size + shard.size_bytes
         if progress is not None:
@@ -43,7 +43,7 @@ def path_of(shard: SnapshotShard) -> str:
     return f"{shard.hand}/{shard.object}/{shard.kind}-{shard.batch:05}.h5"
 
 
-def _make(folder: Path) -> None:
+def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -13,7 +13,7 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json, job_id
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.fidelity import AUTO
-from graspd.service.model.records import Choice, DatasetRecord, Member, request_of
+from graspd.service.model.records import DatasetMember, DatasetRecord, FidelityChoice, create_job_request
 from graspd.service.model.renamed import original_request
 from graspd.service.model.states import Stage
 from graspd.service.model.version import STAGE_REVISIONS
@@ -34,13 +34,13 @@ class Matrix(JobOptions):
     sets: Names = Field((), max_length=100, description="names of sets of objects; these follow `objects`")
 
     @model_validator(mode="after")
-    def _has_objects(self) -> Self:
+    def _require_objects(self) -> Self:
         if not self.objects and not self.sets:
             raise ValueError("a dataset needs objects: name objects, or a set of objects")
         return self
 
     @property
-    def shared(self) -> JobOptions:
+    def cell_options(self) -> JobOptions:
         return JobOptions(**{name: getattr(self, name) for name in JobOptions.model_fields})
 
 
@@ -49,7 +49,7 @@ class DatasetRequest(Matrix):
 
     @field_validator("name")
     @classmethod
-    def _is_free(cls, value: str) -> str:
+    def _refuse_reserved_name(cls, value: str) -> str:
         if value == "estimate":
             raise ValueError("this name is reserved for estimates; choose another one")
         return value
@@ -57,10 +57,10 @@ class DatasetRequest(Matrix):
 
 def create_record(
     name: str,
-    hands: Sequence[Member],
-    objects: Sequence[Member],
+    hands: Sequence[DatasetMember],
+    objects: Sequence[DatasetMember],
     options: JobOptions,
-    choose: Callable[[JobRequest], tuple[JobRequest, Choice | None]],
+    choose: Callable[[JobRequest], tuple[JobRequest, FidelityChoice | None]],
     owner: str = "",
     project: str = "",
 ) -> DatasetRecord:
@@ -68,7 +68,9 @@ def create_record(
 
     `choose` replaces the fidelity `auto` of a cell, or raises InputError if none meets the target.
     """
-    cells = [(hand, obj, *choose(request_of(options, hand.name, obj.name))) for hand in hands for obj in objects]
+    cells = [
+        (hand, obj, *choose(create_job_request(options, hand.name, obj.name))) for hand in hands for obj in objects
+    ]
     fidelities = tuple(str(request.fidelity) for _, _, request, _ in cells) if options.fidelity == AUTO else ()
     found = [choice for *_, choice in cells if choice is not None]
     places = {choice: place for place, choice in enumerate(dict.fromkeys(found))}

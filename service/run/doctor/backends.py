@@ -28,7 +28,7 @@ from graspd.service.model.errors import (
     QueueUnavailable,
     UnavailableError,
 )
-from graspd.service.pipeline.identity import Identity, recorded_service, service_ids
+from graspd.service.pipeline.identity import ServiceIdentity, recorded_service, service_ids
 from graspd.service.queue.connection import connect, redis_url, socket_path
 from graspd.service.queue.rq_queue import open_queue
 from graspd.service.run.doctor.checks import Finding, bad, good, skipped, warning
@@ -66,7 +66,7 @@ def check_redis(settings: Settings) -> Finding:
         with redis_connection(settings) as client:
             return _check_redis(settings, client, dict(client.info()))
     except (RedisError, OSError) as error:
-        return bad(f"{_masked_url(settings)} does not answer: {first_line(error)}", _fix(error, settings))
+        return bad(f"{_masked_url(settings)} does not answer: {first_line(error)}", _redis_fix(error, settings))
 
 
 def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> Finding:
@@ -137,7 +137,7 @@ def _masked_url(settings: Settings) -> str:
     return f"{parts.scheme}://{parts.hostname}{f':{parts.port}' if parts.port else ''}{parts.path}"
 
 
-def _fix(error: Exception, settings: Settings) -> str:
+def _redis_fix(error: Exception, settings: Settings) -> str:
     text = str(error).upper()
     if any(word in text for word in ("NOAUTH", "WRONGPASS", "AUTHENTICATION")):
         return "put the password into GRASPD_REDIS_URL: redis://:PASSWORD@HOST:6379/0"
@@ -216,16 +216,16 @@ def check_index_identity(settings: Settings) -> Finding:
     index, redis = None, None
     if not _index_problem(settings):
         with closing(Index(settings.resolved_index_url)) as opened:
-            index = opened.notes.service()
+            index = opened.notes.service_id()
     if is_redis_expected(settings):
         try:
             with closing(open_queue(settings, patience=0)) as queue:
-                redis = queue.service()
+                redis = queue.service_id()
         except QueueUnavailable:
             if index is None:
                 return skipped("there is no index here, and Redis does not answer")
     recorded = recorded_service(settings.data_dir.resolve())
-    found = Identity(service_ids(store), index, redis, recorded, settings.store_url is None)
+    found = ServiceIdentity(service_ids(store), index, redis, recorded, settings.store_url is None)
     if why := found.refusal(store.url):
         return bad(why, "see the message, and GRASPD_STORE_URL, GRASPD_INDEX_URL, GRASPD_REDIS_URL")
     if not found.chain:

@@ -46,12 +46,12 @@ class Check:
 def run_checks(checks: Sequence[Check]) -> Iterator[Finding]:
     """Run all checks at once; yield findings in the order of the checks, each as early as possible."""
     started = time.monotonic()
-    runs = [_Run(check) for check in checks]
+    runs = [_CheckRun(check) for check in checks]
     for run in runs:
         yield run.finding(started + run.check.limit_s)
 
 
-class _Run:
+class _CheckRun:
     """Check in a daemon thread, which does not delay the end of the process."""
 
     def __init__(self, check: Check) -> None:

@@ -21,7 +21,7 @@ from typing import Any, Final
 from redis.exceptions import RedisError
 
 from graspd.service.model.errors import GraspdError, QueueUnavailable
-from graspd.service.model.messages import WorkerBeat
+from graspd.service.model.messages import WorkerHeartbeat
 from graspd.service.model.states import Stage
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.pipeline.leading import PART
@@ -63,7 +63,7 @@ def _waiting_tasks(queue: RqQueue) -> Counter[Stage]:
     return +found
 
 
-def _check_workers(beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
+def _check_workers(beats: list[WorkerHeartbeat], waiting: Counter[Stage]) -> Finding:
     if other := [beat for beat in beats if beat.version != PACKAGE_VERSION]:
         some = ", ".join(sorted({f"{beat.version} on {beat.host}" for beat in other})[:3])
         return bad(f"{len(other)} workers are of another version: {some}", f"install graspd {PACKAGE_VERSION} there")
@@ -87,7 +87,7 @@ def check_port(settings: Settings) -> Finding:
         url = settings.api_url
     expected = url is not None
     url = url or local_url(settings.host, settings.port)
-    found = _readyz(url)
+    found = _query_readiness(url)
     if found is None and not expected:
         return skipped(f"no API runs at {url}")
     if found is None:
@@ -102,7 +102,7 @@ def check_port(settings: Settings) -> Finding:
     return good(f"the API at {url} is ready")
 
 
-def _readyz(url: str) -> dict[str, Any] | None:
+def _query_readiness(url: str) -> dict[str, Any] | None:
     """Return the answer of an API; {} for another server, None if there is no answer."""
     own = [urllib.request.ProxyHandler({})] if "//127.0.0.1" in url else []
     opener = urllib.request.build_opener(*own)
@@ -154,7 +154,7 @@ def _clock_offsets(settings: Settings) -> Iterator[tuple[str, float]]:
             beats = queue.workers()
             # An age up to the next heartbeat is normal; only the excess is a clock offset.
             due = 4 / 3 * settings.lease_s
-            ages = {beat.host: time.time() - _seconds(beat.seen) for beat in beats}
+            ages = {beat.host: time.time() - _unix_seconds(beat.seen) for beat in beats}
             yield from ((host, -age if age < 0 else min(0.0, due - age)) for host, age in ages.items())
     folder = local_store(settings)
     if folder is None or folder.exists():
@@ -169,11 +169,11 @@ def _store_time(settings: Settings) -> float:
     try:
         store.put(key, b"1")
         after = time.time()
-        made = _seconds(store.stamp(key)[1])
+        made = _unix_seconds(store.stamp(key)[1])
     finally:
         store.delete(key)
     return 0.0 if before - 1.0 <= made <= after + 1.0 else made - (before + after) / 2
 
 
-def _seconds(when: str) -> float:
+def _unix_seconds(when: str) -> float:
     return datetime.fromisoformat(when).timestamp()

@@ -38,7 +38,7 @@ def local_store(settings: Settings) -> Path | None:
 
 def check_disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage) -> Finding:
     found = []
-    for what, folder, variable in _folders(settings):
+    for what, folder, variable in _checked_folders(settings):
         there = existing_ancestor(folder)
         free = usage(there)[2]
         facts = os.statvfs(there)
@@ -54,7 +54,7 @@ def check_disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, in
     return good(f"at least {line}")
 
 
-def _folders(settings: Settings) -> Iterable[tuple[str, Path, str]]:
+def _checked_folders(settings: Settings) -> Iterable[tuple[str, Path, str]]:
     """Yield name and path of each folder, and the variable that sets its path."""
     yield "the data folder", settings.data_dir.resolve(), "GRASPD_DATA_DIR"
     if (store := local_store(settings)) is not None:
@@ -75,7 +75,7 @@ def check_data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mou
         return bad(f"{there} cannot be written by user {os.getuid()}", f"chown it, or set GRASPD_DATA_DIR ({folder})")
     parts = {"the index (SQLite)": settings.index_url, "Redis": settings.redis_url}
     kept_here = [part for part, url in parts.items() if url is None]
-    kind = filesystem(there, mounts)
+    kind = filesystem_type(there, mounts)
     if _NETWORK.fullmatch(kind) and kept_here:
         return warning(
             f"{folder} is a network folder ({kind}) and would contain {' and '.join(kept_here)}: locks may fail",
@@ -89,7 +89,7 @@ def check_data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mou
     return good(f"{folder}, {kind or 'a file system of unknown kind'}, private to its user")
 
 
-def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
+def filesystem_type(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
     try:
         lines = [line.split() for line in mounts.read_text().splitlines()]
     except OSError:

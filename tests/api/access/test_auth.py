@@ -20,7 +20,7 @@ from graspd.api.access.auth import SESSION_COOKIE, Proxy
 from graspd.api.access.doctor import check_keys as keys_finding
 from graspd.api.access.keys import KeyFile, KeyLimits, Scope
 from graspd.api.app import create_app
-from graspd.client.access_commands import duration
+from graspd.client.access_commands import parse_duration
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, QueueUnavailable, UnavailableError
 from graspd.service.pipeline.backends import Services
 from graspd.service.run.doctor.checks import Condition
@@ -164,9 +164,9 @@ def test_only_who_may_read_is_told_what_is_wrong_with_a_part(closed: Closed, mon
 
 @pytest.mark.parametrize("text", ["", "90", "d", "-1d", "1w", "1.5h"])
 def test_a_length_of_time_is_read_or_said_to_be_none(text: str) -> None:
-    assert [duration(one).total_seconds() for one in ("90d", "12h", "30m", "45s")] == [7776000, 43200, 1800, 45]
+    assert [parse_duration(one).total_seconds() for one in ("90d", "12h", "30m", "45s")] == [7776000, 43200, 1800, 45]
     with pytest.raises(InputError, match="90d"):
-        duration(text)
+        parse_duration(text)
 
 
 def test_an_address_strangers_reach_needs_a_key(settings: Settings, services: Services, keys: KeyFile) -> None:

@@ -15,10 +15,10 @@ from graspd.api.access.keys import Key, KeyFile, KeyLimits, Scope
 from graspd.api.access.quotas import Quotas
 from graspd.service.index.rebuild import differences
 from graspd.service.model.errors import QuotaError
-from graspd.service.model.records import JobRecord, ObjectSet, object_set_of
+from graspd.service.model.records import JobRecord, ObjectSet, create_object_set
 from graspd.service.model.webhooks import MOST_HOOKS
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.datasets.actions import DatasetRounds
+from graspd.service.pipeline.datasets.actions import DatasetController
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
 from graspd.service.store import library
@@ -191,9 +191,9 @@ def test_of_two_versions_of_a_set_at_once_one_follows_the_other(twins: list[Test
         bodies = [{"name": name, "objects": objects} for objects in (["mug"], ["block"])]
         assert codes(at_once(twins, lambda http, n, bodies=bodies: http.post(SETS, json=bodies[n]))) == [201, 201]
         kept = [read_record(ObjectSet, services.store, one.key) for one in services.store.list(f"object_sets/{name}")]
-        first = next(one for one in kept if one.digest == object_set_of(name, one.objects).digest)
+        first = next(one for one in kept if one.digest == create_object_set(name, one.objects).digest)
         later = next(one for one in kept if one is not first)
-        assert later.digest == object_set_of(name, later.objects, after=first.digest).digest
+        assert later.digest == create_object_set(name, later.objects, after=first.digest).digest
 
 
 def test_of_two_datasets_of_one_name_at_once_one_gets_it(twins: list[TestClient], services: Services) -> None:
@@ -231,7 +231,7 @@ def test_of_two_cancellations_at_once_one_counts(twins: list[TestClient], servic
 
 def test_two_snapshots_at_once_are_one(twins: list[TestClient], services: Services) -> None:
     twins[0].post("/v1/datasets", json=MATRIX | {"name": "all"})
-    DatasetRounds(services).advance()
+    DatasetController(services).advance()
     job = next(services.store.list("jobs")).key
     finish_all(services, read_record(JobRecord, services.store, job))
     answers = at_once(twins, lambda http, _: http.post("/v1/datasets/all/snapshots"))

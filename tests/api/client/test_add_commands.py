@@ -13,9 +13,9 @@ from graspd.client.client import Client
 from graspd.service.cli import CommandGroup
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
-from graspd.service.store.asset_options import sizes_of
+from graspd.service.store.asset_options import parse_sizes
 from graspd.service.store.assets import pack, unpack
-from graspd.service.store.object_sets import files_of_set
+from graspd.service.store.object_sets import find_set_objects
 
 STL = b"solid box\nendsolid box\n"
 MESH = '<mesh filename="{}"/>'
@@ -70,7 +70,7 @@ def test_a_sweep_makes_a_set_of_all_sizes(monkeypatch: pytest.MonkeyPatch, http:
 @pytest.mark.parametrize("text", ["0", "-0.1", "small", "0.1,", "inf", "nan"])
 def test_a_size_that_is_none_is_a_mistake(text: str) -> None:
     with pytest.raises(InputError, match="must be a size in metres"):
-        sizes_of(text)
+        parse_sizes(text)
 
 
 def test_a_zip_of_several_meshes_is_a_set(tmp_path: Path) -> None:
@@ -78,9 +78,9 @@ def test_a_zip_of_several_meshes_is_a_set(tmp_path: Path) -> None:
     (tmp_path / "one.zip").write_bytes(pack({"A0.obj": b"v"}))
     described = {"asset.json": b'{"file": "a.obj"}', "a.obj": b"v", "b.obj": b"v"}
     (tmp_path / "described.zip").write_bytes(pack(described))
-    assert set(files_of_set(tmp_path / "many.zip") or {}) == {"A0", "B1"}
-    assert files_of_set(tmp_path / "one.zip") is None
-    assert files_of_set(tmp_path / "described.zip") is None
+    assert set(find_set_objects(tmp_path / "many.zip") or {}) == {"A0", "B1"}
+    assert find_set_objects(tmp_path / "one.zip") is None
+    assert find_set_objects(tmp_path / "described.zip") is None
 
 
 @pytest.fixture

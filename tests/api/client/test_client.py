@@ -87,7 +87,7 @@ def test_a_check_that_no_worker_makes_is_waited_for_so_long() -> None:
     answers = iter((ASSET, ASSET | {"verdict": "accept"}))
     client = client_of(lambda _: httpx.Response(200, json=next(answers)))
     with pytest.raises(errors.UnavailableError, match="is a worker running"):
-        client.wait_checked(AssetKind.HAND, "a", timeout_s=-1.0)
+        client.wait_for_check(AssetKind.HAND, "a", timeout_s=-1.0)
 
 
 def test_no_job_is_made_of_a_refused_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -98,7 +98,7 @@ def test_a_cancelled_job_is_a_failure_to_whoever_waits(graspd: Shell, service: S
     assert done.returncode == 1 and f"`graspd retry {job[:12]}` runs it again" in said(done)
     with Client(service.api_url) as client, remote.Client(service.api_url) as user:
         one, again = user.job(job), client.job(job).request
-        show = lambda: demo.run(client, again, tmp_path, plain_console())  # noqa: E731
+        show = lambda: demo.run_job(client, again, tmp_path, plain_console())  # noqa: E731
         for call, words in ((one.wait, "ended cancelled"), (one.grasps, "no grasps yet"), (show, "the job cancelled")):
             with pytest.raises(GraspdError, match=words):
                 call()

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from graspd.client.dataset_commands import PlanRequest, plan_request, read_spec
+from graspd.client.dataset_commands import DatasetPlan, dataset_plan, read_spec
 from graspd.service.command_options import parse_pairs
 from graspd.service.model.errors import InputError
 from graspd.service.pipeline.datasets.spec import MAX_CELLS
@@ -28,8 +28,8 @@ def spec(folder: Path, text: str, name: str = "kitchen.toml") -> Path:
     return folder / name
 
 
-def asked(file: Path | None, *, hands: str | None = None, objects: str | None = None, **options: Any) -> PlanRequest:
-    return plan_request(file, name=None, hands=hands, objects=objects, options=options)
+def asked(file: Path | None, *, hands: str | None = None, objects: str | None = None, **options: Any) -> DatasetPlan:
+    return dataset_plan(file, name=None, hands=hands, objects=objects, options=options)
 
 
 def test_a_spec_says_it_all_in_toml_and_in_json(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ CREATED = "2026-11-26T03:14:11.123456Z"
 _DONE = {"state": State.SUCCEEDED, "progress": 1.0, "created": CREATED, "model_dump": dict}
 _JOB = {"id": ID + "0" * 20, "hand": NAME, "object": NAME, "standing": "valid"}
 JOB = SimpleNamespace(**dict.fromkeys(("valid", "grasps", "requested"), 100_000), **_JOB, **_DONE)
-_DATASET = {"name": NAME, "cells": 1000, "counted": 10**6, "asked": 10**6, "size_bytes": 10**9 + 1}
+_DATASET = {"name": NAME, "cells": 1000, "counted_grasps": 10**6, "asked": 10**6, "size_bytes": 10**9 + 1}
 DATASET = SimpleNamespace(**_DATASET, **_DONE, options=JobOptions())
 _UPLOAD = {"name": NAME, "filename": NAME, "size_bytes": 10**6, "builtin": False, "verdict": "ok", "facts": {}}
 ASSET = SimpleNamespace(**_UPLOAD, digest=ID + "0" * 52, model_dump=dict)
@@ -125,6 +125,6 @@ def test_a_report_names_the_standing_of_what_it_counts(services: Services, valid
     validated = "not validated" if validation == "none" else "at"
     assert f"per {word} grasp" in out.getvalue() and f"{made}/32 {validated}" in out.getvalue()
     assert not re.search(rf"\b{other}\b", out.getvalue())
-    assert JobOptions(want="candidates", validation="none").standing == "kept"
+    assert JobOptions(want="candidates", validation="none").displayed_status == "kept"
     reasons = [line for line in out.getvalue().splitlines() if line.startswith("reason: ")]
     assert reasons == ([] if validation == "none" else [f"reason: {dataset.reason}"])

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from graspd.api.catalog.datasets import Datasets, Pair
+from graspd.api.catalog.datasets import CellPair, Datasets
 from graspd.api.dashboard.figures import service_grid
 from graspd.service.index.queries.grasps import GraspFilter
 from graspd.service.index.views import MatrixCell
@@ -90,7 +90,7 @@ def test_a_dataset_is_made_watched_retried_and_frozen(http: TestClient, services
 def test_a_dataset_is_made_in_scenes_with_neighbours(http: TestClient, services: Services) -> None:
     form = {"name": "clutter", "grasps": "32", "hands": ["allegro"], "objects": ["mug"], "neighbours": "block, bottle"}
     assert "on a table with neighbours block, bottle" in http.post("/datasets", data=form | {"scene": "table"}).text
-    assert [one.object for one in services.index.datasets.get("clutter").options.beside] == ["block", "bottle"]
+    assert [one.object for one in services.index.datasets.get("clutter").options.all_neighbours] == ["block", "bottle"]
     wrong = http.post("/datasets", data=form | {"name": "afloat"})
     assert wrong.status_code == 422 and "neighbours need a scene" in wrong.text
     assert 'value="block, bottle"' in wrong.text and 'value="afloat"' in wrong.text, "what was typed stays"
@@ -212,4 +212,4 @@ def test_distributions_of_two_share_bins_and_too_many_cells_are_left_out(
     assert [a + b for a, b in zip(one.counts, other.counts, strict=True)] == both.counts
     monkeypatch.setattr("graspd.api.catalog.datasets.MOST_CELLS", 1)
     datasets = Datasets(services, None)  # type: ignore[arg-type]
-    assert datasets.compare("rough", "fine").pairs == [] and Pair("hand", "object", None, None).gain is None
+    assert datasets.compare("rough", "fine").pairs == [] and CellPair("hand", "object", None, None).gain is None

@@ -7,7 +7,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from graspd.api.catalog.grasps import validated_by
-from graspd.service.model.metrics import AXIS_MEANINGS, Axis
+from graspd.service.model.metrics import AXIS_MEANINGS, PerturbedParameter
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.shards import Shard, read_shard
 from graspd.worker.validation.protocol import ValidatedBy
@@ -71,17 +71,17 @@ def test_robust_grasps_are_found_by_share_and_first_failure(http: TestClient, se
     row = int(np.flatnonzero((share < 0.9) & (weakest > 0))[0])
     document = http.get(f"/v1/grasps/{manifest.shard_id}/{row}").json()
     assert document["robust_share"] == pytest.approx(share[row])
-    assert document["robust_weakest"] == Axis(int(weakest[row])).word
+    assert document["robust_weakest"] == PerturbedParameter(int(weakest[row])).word
 
     def found(**where: object) -> set[int]:
         query = {"limit": 200, "job": job.id, **where}
         return {one["row"] for one in http.get("/v1/grasps", params=query).json()["items"]}
 
     assert found(min_robust_share=0.75) == set(np.flatnonzero(share >= 0.75).tolist())
-    assert found(robust_weakest="friction") == set(np.flatnonzero(weakest == Axis.FRICTION).tolist())
+    assert found(robust_weakest="friction") == set(np.flatnonzero(weakest == PerturbedParameter.FRICTION).tolist())
     assert http.get("/v1/grasps", params={"robust_weakest": "luck"}).status_code == 422
     page = http.get(f"/grasps/{manifest.shard_id}/{row}").text
-    assert "Robust share" in page and f"first failure: {AXIS_MEANINGS[Axis(int(weakest[row]))]}" in page
+    assert "Robust share" in page and f"first failure: {AXIS_MEANINGS[PerturbedParameter(int(weakest[row]))]}" in page
 
 
 def test_forms_tag_chosen_grasps_and_lead_back_to_the_list(http: TestClient, services: Services) -> None:

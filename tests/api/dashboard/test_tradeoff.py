@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
 from graspd.api.dashboard.figures import PITCH, draw_map
-from graspd.api.dashboard.tradeoff import HEIGHT, WIDTH, Measured, draw_chart
+from graspd.api.dashboard.tradeoff import HEIGHT, WIDTH, PublishedChart, draw_chart
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.service.model.studies import FILTERED, IN_SCENE, MapCell, Outcome, Stability, StabilityMap, pareto
+from graspd.service.model.studies import FILTERED, IN_SCENE, MapCell, Outcome, Stability, StabilityMap, pareto_front
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.records import publish_record
 
@@ -28,28 +28,30 @@ RUNS = [run("draft", 9.0, 0.6), run("standard", 4.0, 0.8), run("fine", 3.0, 0.75
 
 @given(st.lists(st.tuples(st.integers(0, 20), st.integers(0, 20)), max_size=20))
 def test_the_front_is_what_nothing_beats(points: list[tuple[int, int]]) -> None:
-    front = pareto(points)
+    front = pareto_front(points)
     beaten = {i for i, p in enumerate(points) if any(q[0] >= p[0] and q[1] >= p[1] and q != p for q in points)}
     assert front == set(range(len(points))) - beaten
 
 
 def test_a_point_is_the_mean_of_end_to_end_seconds_before_the_planners_own() -> None:
     runs = [run("draft", 1.0, 0.4), run("draft", 4.0, 0.8, object="block")]
-    (point,) = draw_chart(Measured.model_validate({"runs": runs}), axis="gsr").points
+    (point,) = draw_chart(PublishedChart.model_validate({"runs": runs}), axis="gsr").points
     assert point.pairs == 2 and point.speed == pytest.approx(math.sqrt(1.0 * 4.0))
     assert point.accuracy == pytest.approx(60.0)
     runs = [run("draft", 90.0, 0.6, kept=10, end_seconds=[2.0, 3.0]), run("fine", 95.0, 0.9, kept=0, end_seconds=[1.0])]
-    drawn = draw_chart(Measured.model_validate({"runs": runs}), axis="gsr")
+    drawn = draw_chart(PublishedChart.model_validate({"runs": runs}), axis="gsr")
     assert [(point.fidelity, point.speed) for point in drawn.points] == [("draft", 2.0)]
     assert drawn.nothing == ["fast_graspd fine"]
 
 
 def test_faster_is_further_right_and_better_is_higher() -> None:
-    points = {point.fidelity: point for point in draw_chart(Measured.model_validate({"runs": RUNS}), axis="gsr").points}
+    points = {
+        point.fidelity: point for point in draw_chart(PublishedChart.model_validate({"runs": RUNS}), axis="gsr").points
+    }
     assert points["draft"].x > points["standard"].x > points["fine"].x
     assert points["standard"].y < points["fine"].y < points["draft"].y
     assert [name for name, point in points.items() if not point.on_front] == ["fine"]
-    less_is_better = draw_chart(Measured.model_validate({"runs": RUNS}), axis="pd_mm").points
+    less_is_better = draw_chart(PublishedChart.model_validate({"runs": RUNS}), axis="pd_mm").points
     assert {point.fidelity for point in less_is_better if point.on_front} == {"draft", "standard"}
 
 
@@ -66,7 +68,7 @@ def scenes_of(kind: str, *runs: dict[str, object]) -> dict[str, object]:
 
 def test_speeds_in_scenes_are_lifted_grasps_over_seconds() -> None:
     runs = [lifted("draft", 16), lifted("draft", 0, object="block"), lifted("draft", 4, way=FILTERED)]
-    drawn = draw_chart(Measured.model_validate(scenes_of("table", *runs)), axis="lift")
+    drawn = draw_chart(PublishedChart.model_validate(scenes_of("table", *runs)), axis="lift")
     assert [(point.method, point.speed, point.accuracy) for point in drawn.points] == [
         ("fast_graspd, filtered", 1.0, pytest.approx(20.0)),
         ("fast_graspd", 2.0, pytest.approx(40.0)),
@@ -78,7 +80,7 @@ def test_speeds_in_scenes_are_lifted_grasps_over_seconds() -> None:
 def test_no_label_lies_on_another_or_leaves_the_chart(shares: tuple[int, ...]) -> None:
     """Slow ones beside each other, and a fast one that makes the axis long."""
     runs = [lifted(f"fidelity {n}", 19, end_seconds=400.0 + 40 * n, lift=s / 20) for n, s in enumerate(shares)]
-    drawn = draw_chart(Measured.model_validate(scenes_of("table", lifted("fast", 9), *runs)), axis="lift")
+    drawn = draw_chart(PublishedChart.model_validate(scenes_of("table", lifted("fast", 9), *runs)), axis="lift")
     boxes = [point.label_box(point.label_y - 4 - point.y, is_left=point.is_left) for point in drawn.points]
     assert len(boxes) == 4
     for one, other in itertools.combinations(boxes, 2):

@@ -11,7 +11,7 @@ from starlette.testclient import TestClient
 
 from graspd.api.access.keys import KeyFile, Scope
 from graspd.api.app import create_app
-from graspd.api.middleware.request_context import RootPath, with_prefix
+from graspd.api.middleware.request_context import RootPath, add_prefix
 from graspd.client.client import Client
 from graspd.service.model.errors import InputError
 from graspd.service.pipeline.backends import Services
@@ -94,10 +94,10 @@ def test_api_and_client_work_below_a_prefix(http: TestClient, services: Services
 def test_addresses_of_this_host_alone_get_the_prefix() -> None:
     links = '<a href="//cdn/x"><a href="https://x/"><a href="#x"><a href="?x">'
     same = f'<p title="/x">="/x"</p>{links}<input value="/jobs">'
-    assert with_prefix(same, PREFIX) == same
+    assert add_prefix(same, PREFIX) == same
     prefixed = {"/x?a=/b#c": "/graspd/x?a=/b#c", "http://me/x": "http://me/graspd/x"}
     for where, expected in (prefixed | {other: other for other in ("http://you/x", "x", "?x")}).items():
-        assert RootPath(create_app, prefix=PREFIX)._below(where, "me") == expected  # type: ignore[arg-type]
+        assert RootPath(create_app, prefix=PREFIX)._add_prefix(where, "me") == expected  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("said", ["/a b", "/a?b", "/ü", "/../x", "http://x/y", '/"x', "/a//b"])

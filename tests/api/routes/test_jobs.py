@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from graspd.client.client import events_of
+from graspd.client.client import parse_events
 from graspd.service.model.clock import timestamp
 from graspd.service.model.metrics import GraspType
 from graspd.service.model.planning import plan_tasks
@@ -104,7 +104,7 @@ def test_events_of_a_finished_job_say_its_end(http: TestClient, services: Servic
     finish_all(services, record)
     with http.stream("GET", f"/v1/jobs/{record.id}/events") as answer:
         assert answer.headers["content-type"].startswith("text/event-stream")
-        events = list(events_of(answer))
+        events = list(parse_events(answer))
     assert [name for name, _ in events] == ["progress", "end"]
     assert events[-1][1]["state"] == "succeeded"
     answer = http.get("/v1/jobs/none/events")

@@ -10,7 +10,7 @@ from fastapi import FastAPI
 from httpx import Response
 from starlette.testclient import TestClient
 
-from graspd.api.dashboard.job_pages import Pictures
+from graspd.api.dashboard.job_pages import ShardPictures
 from graspd.api.routes.jobs import parse_range
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.store import Store
@@ -156,6 +156,6 @@ def test_a_picture_of_a_damaged_shard_is_refused(http: TestClient, services: Ser
     views = finish_all(services, add_job(services, scenes=1, views=2, width=24, height=16))[-1]
     assert http.get(f"/shards/{views.shard_id}/pictures/0.png").status_code == 200
     flip(services.store, views.key)
-    http.app.state.pictures = Pictures(services.store)  # type: ignore[attr-defined]
+    http.app.state.pictures = ShardPictures(services.store)  # type: ignore[attr-defined]
     answer = http.get(f"/shards/{views.shard_id}/pictures/0.png")
     assert answer.status_code == 500 and views.key in answer.text

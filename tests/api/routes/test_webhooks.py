@@ -16,7 +16,7 @@ from starlette.testclient import TestClient
 from graspd.api.access.keys import Scope
 from graspd.api.app import create_app
 from graspd.service.index.index import Index
-from graspd.service.index.outbox import append_ends
+from graspd.service.index.outbox import append_end_events
 from graspd.service.index.rebuild import rebuild
 from graspd.service.model.webhooks import WAITS_S, Webhook
 from graspd.service.pipeline.backends import Services
@@ -185,7 +185,9 @@ def hooks(services: Services, count: int, project: str, host: str, created: str 
 def end_jobs_of(services: Services, projects: str, seq: str = "") -> None:
     ended = {"kind": "job", "state": "succeeded", "owner": ""}
     with services.index.database.write_transaction() as connection:
-        append_ends(connection, [ended | {"subject": f"{project}{seq}", "project": project} for project in projects])
+        append_end_events(
+            connection, [ended | {"subject": f"{project}{seq}", "project": project} for project in projects]
+        )
 
 
 class Silent(Ear):
@@ -275,4 +277,4 @@ def test_an_address_that_may_not_be_reached_is_given_up_at_once(services: Servic
     end_jobs_of(services, "a", "2")
     ear.answer = Response(None, "the address is not public", is_final=True)
     assert ear.round() == 1 and ear.round(10 * WAITS_S[-1]) == 0
-    assert {one.state for one in services.index.outbox.log(f"a{0:031}")} == {"failed"}
+    assert {one.state for one in services.index.outbox.delivery_log(f"a{0:031}")} == {"failed"}

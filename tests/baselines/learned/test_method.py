@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from graspd.baselines.learned import network as net
-from graspd.baselines.learned.method import ELEVATION, NEAREST_M, RETREATS, Seeds, SurfaceView
+from graspd.baselines.learned.method import ELEVATION, NEAREST_M, RETREATS, NetworkStarts, SurfaceView
 from graspd.baselines.learned.network import Proposals, encode, save
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import resolve_fidelity
@@ -99,7 +99,7 @@ def proposing(network: ProposalNetwork, found: Proposals, anchor: np.ndarray) ->
 def started(pair: Pair, network: ProposalNetwork, height: float, placed: PlacedGrasps) -> HandState:
     """Clear starts, two a grasp, from a network that proposes a palm at a height above the anchor [m]."""
     hand, obj, each = pair.hand.model, pair.coarse.obj.model, 2
-    seeds = Seeds(proposing(network, down(hand, height), np.zeros(3)), each)
+    seeds = NetworkStarts(proposing(network, down(hand, height), np.zeros(3)), each)
     obstacles = DeviceObstacles.create(hand, placed.scenes, obj.centre_of_mass, "cpu")
     model = pair.model(pair.coarse, obstacles)
     generators = [start_generator(0, 0, i, k) for i in range(len(placed.index)) for k in range(each)]
@@ -175,7 +175,7 @@ def test_what_it_cannot_do_is_said_in_a_line(hand, network, tmp_path: Path) -> N
 
 
 def test_points_lie_on_the_surface_and_are_seen_by_the_camera() -> None:
-    seen, rng = SurfaceView.of(MUG), np.random.default_rng(3)
+    seen, rng = SurfaceView.from_object(MUG), np.random.default_rng(3)
     mesh = trimesh.Trimesh(apply(POSE, MUG.vertices), MUG.faces, process=False)
     for _ in range(3):
         camera = seen.camera(POSE, rng)
@@ -195,7 +195,7 @@ def test_points_lie_on_the_surface_and_are_seen_by_the_camera() -> None:
 
 
 def test_cameras_stand_where_pictures_have_them() -> None:
-    seen, rng = SurfaceView.of(MUG), np.random.default_rng(0)
+    seen, rng = SurfaceView.from_object(MUG), np.random.default_rng(0)
     middle = apply(POSE, MUG.centre_of_mass)
     out = np.array([seen.camera(POSE, rng) - middle for _ in range(200)])
     distance = np.linalg.norm(out, axis=1)

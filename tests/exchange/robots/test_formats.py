@@ -21,7 +21,14 @@ from graspd.exchange.inputs import load_case
 from graspd.exchange.opening import READERS, check_written_files
 from graspd.exchange.plan import prim_name, prim_names
 from graspd.exchange.robots import execution
-from graspd.exchange.robots.execution import POSTURES, Executions, executions, straight_paths, time_motions, tool_frame
+from graspd.exchange.robots.execution import (
+    POSTURES,
+    Executions,
+    build_executions,
+    straight_paths,
+    time_motions,
+    tool_frame,
+)
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.transforms import IDENTITY_POSE, apply, compose, invert, pose_to_matrix, quat_to_matrix, slerp
 from graspd.service.store.shards import read_shard, write_shard
@@ -29,7 +36,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.rendering.hands import hand_parts
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.model import MujocoOptions, build
+from graspd.worker.validation.model import MujocoOptions, build_scene
 from graspd.worker.validation.protocol import Test as Rollout
 from tests.conftest import REPOSITORY
 from tests.exchange.robots.arms import rows
@@ -284,7 +291,7 @@ def of_shard(file: Path) -> Executions:
     case = load_case(file)
     given = {"rows": np.arange(len(case.grasps)), "placed": case.placed, "tool": TOOL}
     quality = {"valid": read_shard(file, kind="base")["quality/valid"]}
-    return executions(case.hand, case.obj, case.grasps, **given, quality=quality)
+    return build_executions(case.hand, case.obj, case.grasps, **given, quality=quality)
 
 
 @pytest.fixture(scope="module")
@@ -300,7 +307,7 @@ def test_a_free_grasp_is_reached_and_left_over_ten_centimetres(free: Executions)
 
 def test_open_hand_touches_nothing_of_a_free_object_on_its_way(free: Executions) -> None:
     """MuJoCo is the oracle: its convex pieces of the object stand out from the surface by up to 2 mm."""
-    rollout = Rollout(build(free.hand, free.obj, decompose(free.obj), MujocoOptions()))
+    rollout = Rollout(build_scene(free.hand, free.obj, decompose(free.obj), MujocoOptions()))
     assert len(free) >= 4
     for start, end in (("standoff", "arrival"), ("arrival", "pregrasp")):
         a, b = free.postures[start], free.postures[end]
@@ -309,7 +316,7 @@ def test_open_hand_touches_nothing_of_a_free_object_on_its_way(free: Executions)
                 place = (1 - share) * a.hand_pose[row, :3] + share * b.hand_pose[row, :3]
                 turn = slerp(a.hand_pose[row, 3:], b.hand_pose[row, 3:], float(share))
                 joints = (1 - share) * a.joint_positions[row] + share * b.joint_positions[row]
-                rollout._put(np.concatenate([place, turn]), joints)
+                rollout._set_posture(np.concatenate([place, turn]), joints)
                 mujoco.mj_forward(rollout.scene.model, rollout.data)
                 assert rollout.penetration()[0] < 0.002
 
@@ -322,7 +329,7 @@ def test_grasps_without_a_free_way_are_left_out_none_is_refused() -> None:
     ball = object_from_mesh(trimesh.util.concatenate([shell, inner]))
     caught = grasp_set(posture(((0.0, 0, 0), (0.0, 0.0))))
     with pytest.raises(InputError, match="free of the object"):
-        executions(hand, ball, caught, rows=np.zeros(1, int), placed=None, tool=TOOL, quality={})
+        build_executions(hand, ball, caught, rows=np.zeros(1, int), placed=None, tool=TOOL, quality={})
 
 
 def test_in_scene_ways_of_shard_are_kept_in_frame_of_the_scene(table_shard: Path) -> None:
@@ -385,7 +392,7 @@ def test_trajectories_stay_within_limits_and_reach_every_posture(free: Execution
 
 def test_limits_are_those_of_the_hand_or_assumed(free: Executions) -> None:
     hand = replace(free.hand, velocity=np.concatenate([[3.0], np.zeros(free.hand.dofs - 1)]))
-    found = execution.hand_limits(hand)
+    found = execution.velocity_limits(hand)
     leads = hand.dof[hand.joint_body] == 0
     np.testing.assert_allclose(found.velocity[leads], 3.0 * np.abs(hand.multiplier[hand.joint_body][leads]))
     assert (found.velocity[~leads] == execution.ASSUMED_RAD_S).all()

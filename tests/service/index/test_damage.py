@@ -98,7 +98,7 @@ def test_a_rebuild_leaves_out_damage_and_names_it(services: Services, record: st
     key = RECORDS[record](services)
     overwrite(services.store, key, DAMAGED)
     fresh = lost(services)
-    Controller(fresh).round()
+    Controller(fresh).run_round()
     assert shown(fresh.index) == GOOD - (record == "job")
     made = fresh.index.notes.completeness()
     assert made is not None and (made.left_out, made.names) == (1, (key,))
@@ -110,9 +110,9 @@ def test_a_record_that_was_mended_is_there_again(services: Services) -> None:
     whole = services.store.get(key)
     overwrite(services.store, key, DAMAGED)
     fresh = lost(services)
-    Controller(fresh).round()
+    Controller(fresh).run_round()
     overwrite(services.store, key, whole)
-    Controller(fresh).round()
+    Controller(fresh).run_round()
     assert shown(fresh.index) == GOOD
     assert (made := fresh.index.notes.completeness()) is not None
     assert made.left_out == 0
@@ -123,13 +123,13 @@ def test_a_damaged_attempt_fails_its_task_and_stops_no_round(services: Services)
     clock, job = Clock(), a_job(services)
     controller = Controller(services, clock=clock)
     overwrite(services.store, attempt_of(services), DAMAGED)
-    controller.round()
+    controller.run_round()
     taken = [services.queue.take("w") for _ in range(GOOD)]  # type: ignore[attr-defined]
     assert job in {delivery.message.job_id for delivery in taken}
     services.queue._held.clear()  # type: ignore[attr-defined]  # Redis lost tasks and leases
     for _ in range(3):
         clock.now += LOST_AFTER_S
-        controller.round()
+        controller.run_round()
     failed = [found.id for found in services.index.jobs.page().items if found.state is State.FAILED]
     assert failed == [job], "the attempts of the others can be counted, and they run again"
 
@@ -137,12 +137,12 @@ def test_a_damaged_attempt_fails_its_task_and_stops_no_round(services: Services)
 @pytest.mark.parametrize("files", ["index.sqlite*", "index.sqlite"])
 def test_an_index_removed_under_its_readers_is_made_again(services: Services, files: str) -> None:
     controller = Controller(services)
-    controller.round()
+    controller.run_round()
     other = Index(services.settings.resolved_index_url)
     assert shown(other) == GOOD
     for path in services.settings.data_dir.glob(files):
         path.unlink()
-    controller.round()
+    controller.run_round()
     assert shown(other) == shown(services.index) == GOOD
     job_actions.submit(Services(services.settings, services.store, other, services.queue), request(seed=50))
     assert shown(services.index) == GOOD + 1
@@ -183,11 +183,11 @@ def test_a_damaged_file_gives_way_to_a_rebuilt_one(services: Services) -> None:
 @pytest.mark.parametrize(("name", "start"), [("index.sqlite-wal", 0), ("index.sqlite", 0), ("index.sqlite", 4096)])
 def test_a_controller_outlives_a_damaged_index(services: Services, name: str, start: int) -> None:
     controller = Controller(services)
-    controller.round()
+    controller.run_round()
     scribble(services.settings.data_dir, name, start)
     for _ in range(4):
         try:
-            controller.round()
+            controller.run_round()
         except IndexUnavailable:
             continue
     assert shown(services.index) == GOOD

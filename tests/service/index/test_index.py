@@ -20,7 +20,7 @@ from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.index.views import GraspView
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError, IndexUnavailable, InputError, StoreUnavailable
-from graspd.service.model.planning import OUTCOMES, RoundRobin, message_of, plan_tasks
+from graspd.service.model.planning import OUTCOMES, RoundRobin, create_task_message, plan_tasks
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
@@ -312,7 +312,7 @@ def test_writers_at_once_leave_the_rows_of_the_store(services: Services, index_u
     """The controller indexes shards while the API of another process cancels and retries their job, over and over."""
     job, _ = job_actions.submit(services, request(grasps=32 * 6, scenes=1))
     record = record_of(services, job.id)
-    messages = [message_of(record, task, attempt=1, max_attempt=3) for task in plan_tasks(record)]
+    messages = [create_task_message(record, task, attempt=1, max_attempt=3) for task in plan_tasks(record)]
     other = Services(services.settings, services.store, Index(index_url), services.queue)
     done = threading.Event()
 

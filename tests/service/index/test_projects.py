@@ -18,7 +18,7 @@ from graspd.service.index.views import UsageDay
 from graspd.service.model import names
 from graspd.service.model.errors import InputError
 from graspd.service.model.messages import Origin
-from graspd.service.model.planning import RoundRobin, message_of, plan_tasks
+from graspd.service.model.planning import RoundRobin, create_task_message, plan_tasks
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import Priority
@@ -33,9 +33,9 @@ DAY, NEXT = "2026-11-20", "2026-11-21"
 
 def enter(services: Services, project: str, seed: int, *, key: str = "", batches: int = 1, where: int = 0) -> JobRecord:
     """A bulk job of a project, none of it in the queue; `where` is the first digit of its id."""
-    record = job_actions.prepare(services, request(grasps=32 * batches, seed=seed), priority=Priority.BULK).model_copy(
-        update={"id": f"{where:x}{seed:031x}", "origin": Origin(key=key or project), "project": project}
-    )
+    record = job_actions.prepare_job(
+        services, request(grasps=32 * batches, seed=seed), priority=Priority.BULK
+    ).model_copy(update={"id": f"{where:x}{seed:031x}", "origin": Origin(key=key or project), "project": project})
     put_record(services.store, names.job_record_key(record.id), record)
     services.index.write.add_job(record)
     return record
@@ -43,7 +43,8 @@ def enter(services: Services, project: str, seed: int, *, key: str = "", batches
 
 def make(services: Services, record: JobRecord, *, day: str = DAY, device: str = "cuda:0", seconds: float = 10) -> int:
     made = [
-        make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3)) for task in plan_tasks(record)
+        make_shard(services.store, create_task_message(record, task, attempt=1, max_attempt=3))
+        for task in plan_tasks(record)
     ]
     told = {"created": f"{day}T12:00:00.000000Z", "device": device, "seconds": seconds}
     services.index.write.add_manifests([manifest.model_copy(update=told) for manifest in made])

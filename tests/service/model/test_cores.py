@@ -11,7 +11,7 @@ import pytest
 
 from graspd.service.model import cores, libraries
 from graspd.service.model.cores import available_cores, available_memory
-from graspd.service.model.libraries import mark_process, pause_garbage_collection
+from graspd.service.model.libraries import freeze_imports, pause_garbage_collection
 from tests.conftest import PACKAGES, REPOSITORY
 
 MACHINE = 16
@@ -115,7 +115,7 @@ def test_only_a_process_of_graspd_s_own_keeps_what_is_there(monkeypatch: pytest.
     with pause_garbage_collection():
         pass
     assert not frozen
-    mark_process()
+    freeze_imports()
     with pause_garbage_collection():
         pass
     assert frozen

@@ -13,12 +13,12 @@ from graspd.service.index.condition import read_condition
 from graspd.service.index.index import Index
 from graspd.service.model.base import first_error
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, without_secrets
-from graspd.service.model.names import shorten
+from graspd.service.model.names import shorten_name
 from graspd.service.queue.connection import connect
 from graspd.service.run.address import ListenAddress
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
-from graspd.service.telemetry import JsonLines, _TextLines
+from graspd.service.telemetry import JsonFormatter, _TextFormatter
 from tests.fakes import request
 
 
@@ -69,7 +69,7 @@ QUOTING = [
 def test_an_error_and_a_log_line_hold_no_secret(text: str) -> None:
     record = logging.LogRecord("graspd", logging.WARNING, "", 0, "%s", (text,), None)
     record.detail = text
-    told = (str(GraspdError(text)), JsonLines("api").format(record), _TextLines().format(record))
+    told = (str(GraspdError(text)), JsonFormatter("api").format(record), _TextFormatter().format(record))
     assert not [one for one in told if SECRET in one]
 
 
@@ -116,7 +116,7 @@ LONG = "mujoco-Office_Depot_Canon_CL211XL_Remanufactured_Ink_Cartridge_TriColor"
 def test_a_long_name_of_an_upload_is_refused_others_are_cut(caplog: pytest.LogCaptureFixture) -> None:
     with pytest.raises(InputError, match=f"the name {LONG} has 71 characters, more than 64; give"):
         name_of_upload(f"{LONG}.stl")
-    shorten.cache_clear()
+    shorten_name.cache_clear()
     first, second = plain_name(LONG), plain_name(f"{LONG}2")
     assert first != second and len(first) == len(second) == 64
     assert plain_name(LONG) == first

@@ -11,17 +11,23 @@ from pydantic import ValidationError
 from graspd.service.model import planning
 from graspd.service.model.digests import digest_json, job_id, shard_id
 from graspd.service.model.domain import BATCH_SIZE, RECHECKS, SCENES, JobOptions, JobRequest
-from graspd.service.model.metrics import AXIS_MEANINGS, MIN_DISTANCE_M, ROBUST_MODELS, Axis, axis_word
+from graspd.service.model.metrics import (
+    AXIS_MEANINGS,
+    MIN_DISTANCE_M,
+    ROBUST_MODELS,
+    PerturbedParameter,
+    perturbed_parameter_name,
+)
 from graspd.service.model.planning import (
     MAX_BACKOFF_S,
     OUTCOMES,
     TaskFacts,
+    create_task_message,
     explain_shortfall,
-    message_of,
     plan_tasks,
     sum_outcomes,
 )
-from graspd.service.model.records import DatasetRecord, JobRecord, Member
+from graspd.service.model.records import DatasetMember, DatasetRecord, JobRecord
 from graspd.service.model.renamed import original_request
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.model.version import STAGE_REVISIONS
@@ -63,14 +69,14 @@ def test_a_default_stays_out_of_documents_and_ids_and_another_value_moves_the_gr
 
 
 def test_a_wanted_share_is_of_eight_models_unless_told() -> None:
-    assert (request().models, request(robust=0.9).models) == (0, ROBUST_MODELS)
-    assert request(robust=0.9, scene="table").models == ROBUST_MODELS, "in scenes as around free objects"
-    assert request(robust=0.9, robust_models=16).models == request(robust_models=16).models == 16
+    assert (request().model_count, request(robust=0.9).model_count) == (0, ROBUST_MODELS)
+    assert request(robust=0.9, scene="table").model_count == ROBUST_MODELS, "in scenes as around free objects"
+    assert request(robust=0.9, robust_models=16).model_count == request(robust_models=16).model_count == 16
 
 
 def test_every_axis_has_its_words_and_no_other_number_has() -> None:
-    assert set(AXIS_MEANINGS) == set(Axis) - {Axis.NONE}
-    assert [axis_word(number) for number in (0, 1, 9, 10, 255)] == [None, "shapes", "order", None, None]
+    assert set(AXIS_MEANINGS) == set(PerturbedParameter) - {PerturbedParameter.NONE}
+    assert [perturbed_parameter_name(number) for number in (0, 1, 9, 10, 255)] == [None, "shapes", "order", None, None]
 
 
 #: The DexGraspBench protocol takes 6 pushes of 2 s and 0.8 s of closing, 3,200 steps of MuJoCo; a valid grasp has cost
@@ -116,10 +122,10 @@ def test_a_job_without_a_scene_keeps_its_id_and_its_record() -> None:
     said = {"request": original_request(wanted), "hand": HAND, "object": OBJECT, "revisions": STAGE_REVISIONS}
     assert job.id == digest_json(said)
     (task,) = plan_tasks(job)
-    assert message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json")["request"] == wanted
+    assert create_task_message(job, task, attempt=1, max_attempt=3).model_dump(mode="json")["request"] == wanted
 
 
-MEMBERS = [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)]
+MEMBERS = [DatasetMember(name="h", digest=HAND)], [DatasetMember(name="o", digest=OBJECT)]
 DATASET = create_record("d", *MEMBERS, JobOptions(), lambda one: (one, None))
 
 
@@ -173,13 +179,13 @@ def test_where_no_number_of_scenes_is_named_there_are_a_few() -> None:
 def test_a_document_comes_back_and_fingertips_may_touch_unless_it_says_otherwise() -> None:
     assert "touch" not in request(scene="table").model_dump()
     assert record(request(scene="table", touch=0)).id == record(request(scene="table")).id
-    assert request(scene="table").place.touch == 0
+    assert request(scene="table").scene_spec.touch == 0
     box = {"kind": "box", "size": [0.1, 0.2, 0.3]}
     document = {"supports": [PLANE, box], "touch": -0.5, "target": [0, 0, 1, 1, 0, 0, 0]}
     wanted = request(scene=document)
-    assert (wanted.place.kind, len(wanted.place.supports), wanted.place.touch) == ("file", 2, -0.5)
+    assert (wanted.scene_spec.kind, len(wanted.scene_spec.supports), wanted.scene_spec.touch) == ("file", 2, -0.5)
     assert JobRequest.model_validate_json(wanted.model_dump_json()) == wanted
-    assert request(scene=document, touch=2).place.touch == 2
+    assert request(scene=document, touch=2).scene_spec.touch == 2
 
 
 @pytest.mark.parametrize(
@@ -311,7 +317,7 @@ def test_why_fewer_grasps_were_found_is_told_the_most_frequent_first() -> None:
 
 
 def test_a_limit_of_the_hand_stands_where_the_budget_would() -> None:
-    limit = planning.limit_text("barrett", 0.6, 16, 5.66, math.inf, 100.0)
+    limit = planning.payload_limit_text("barrett", 0.6, 16, 5.66, math.inf, 100.0)
     assert limit == "barrett lifts 5.7 kg at friction 0.6 in the best of 16 grasps; 100 kg are wanted"
     assert (
         str(explain_shortfall(0, 4, "valid", 4, 4, {}, limit)) == f"found 0 of 4 valid grasps in 4 candidates; {limit}"

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from graspd.service.model.errors import InputError
-from graspd.service.model.scene_spec import MAX_FILE_BYTES, SceneSpec, parse_scene, scene_option
+from graspd.service.model.scene_spec import MAX_FILE_BYTES, SceneSpec, parse_scene, parse_scene_option
 from tests.conftest import REPOSITORY
 
 TABLE = {"supports": [{"kind": "half_space"}]}
@@ -85,7 +85,7 @@ def test_how_near_fingertips_come_is_said_by_the_file_or_over_it(tmp_path: Path)
     path = tmp_path / "scene.yaml"
     path.write_text("supports: [{kind: half_space}]\ntouch: -0.5\n")
     assert (parse_scene(str(path)).touch, parse_scene(str(path), touch=1.0).touch) == (-0.5, 1.0)
-    assert scene_option(str(path))["touch"] == -0.5
+    assert parse_scene_option(str(path))["touch"] == -0.5
 
 
 def test_a_free_object_has_no_faces_to_choose() -> None:

@@ -11,7 +11,7 @@ from graspd.service.model.studies import (
     count_outcomes,
     format_short,
     format_tick,
-    from_json,
+    parse_stability,
 )
 from graspd.service.store.records import publish_record
 from graspd.service.store.store import open_store
@@ -41,7 +41,7 @@ def test_what_still_breaks_are_broken_cells_in_reach_of_a_job() -> None:
         MapCell("b", 1.0, "draft", 0.0, "broken"),
         MapCell("b", 2.0, "draft", 0.0, "refused", reached=True),
     )
-    assert one.still_breaks() == ["a 1, 3 (draft, fine); 9 (fine)"]
+    assert one.broken_cell_lines() == ["a 1, 3 (draft, fine); 9 (fine)"]
     assert count_outcomes(one.reached()) == {"good": 1, "weak": 0, "broken": 5, "refused": 1}
 
 
@@ -51,9 +51,9 @@ def test_a_record_survives_the_store_without_odd_numbers() -> None:
     assert (
         publish_record(open_store("memory://"), "stability", record.as_json()) == "stability/20261121T120000000Z.json"
     )
-    found = from_json(record.as_json())
+    found = parse_stability(record.as_json())
     assert [cell.text for cell in found.maps[0].cells] == ["×∞", ""]
     assert found.maps[0].lines == {"a": [(1.0, 2.0)]}
     assert found.as_json() == record.as_json()
     with pytest.raises(ValueError, match="maps"):
-        from_json({"created": "now", "command": "c", "versions": {}})
+        parse_stability({"created": "now", "command": "c", "versions": {}})

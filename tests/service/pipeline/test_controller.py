@@ -43,7 +43,7 @@ class Bench:
             self.clock.now += 1.0
             if beating is not None:
                 self.queue.beat(beating)
-            self.controller.round()
+            self.controller.run_round()
 
     def take(self) -> Delivery:
         delivery = self.queue.take("w")
@@ -81,7 +81,7 @@ class Bench:
 @pytest.fixture
 def bench(services: Services) -> Bench:
     made = Bench(services)
-    made.controller.round()
+    made.controller.run_round()
     return made
 
 
@@ -106,7 +106,7 @@ def test_a_job_goes_through_all_its_stages_and_tells_listeners(bench: Bench) -> 
     done = bench.services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 70)
     assert differences(bench.services.index, bench.services.store) == []
-    told = [e for _, e in bench.queue.tail("0", limit=99, wait_s=0)]
+    told = [e for _, e in bench.queue.events_after("0", limit=99, wait_s=0)]
     assert [e.message for e in told if e.kind is EventKind.JOB] == ["queued", "running", "succeeded"]
     assert {e.job_id for e in told if e.kind is EventKind.JOB} == {job.id}
 
@@ -116,7 +116,7 @@ def test_a_worker_that_beats_keeps_its_task(bench: Bench) -> None:
     delivery = bench.take()
     bench.pass_time(100, beating=delivery)
     bench.clock.now += 3600
-    bench.controller.round()
+    bench.controller.run_round()
     assert [lease.key for lease in bench.queue.leases()] == [delivery.key]
 
 
@@ -130,7 +130,7 @@ def test_while_redis_takes_no_writes_nobody_is_called_silent(bench: Bench, monke
         for _ in range(10 * round(bench.services.settings.lease_s)):
             bench.clock.now += 1.0
             with pytest.raises(QueueUnavailable):
-                bench.controller.round()
+                bench.controller.run_round()
     bench.pass_time(2, beating=held)
     assert [lease.key for lease in bench.queue.leases()] == [held.key]
     assert bench.services.index.jobs.attempts() == []
@@ -234,7 +234,7 @@ def test_redis_lost_whole_loses_no_task(bench: Bench) -> None:
     empty = MemoryQueue()
     bench = Bench(Services(bench.services.settings, bench.services.store, bench.services.index, empty))
     bench.pass_time(LOST_AFTER_S + 2)
-    assert len(empty.waiting()) == 3, "two syntheses, and the scene of the shard whose event was lost"
+    assert len(empty.waiting_tasks()) == 3, "two syntheses, and the scene of the shard whose event was lost"
     bench.work_off()
     assert bench.services.index.jobs.get(job.id).state is State.SUCCEEDED
     assert differences(bench.services.index, bench.services.store) == []
@@ -279,13 +279,13 @@ def test_tasks_queued_while_the_controller_looks_are_queued_once(bench: Bench, m
         seen = ready(index, *given, **named)
         mine = bench.services.index.feed.ready_tasks_of_job(job.id, limit=9)
         job_actions.queue_tasks(bench.services, mine, routes=Routes(bench.queue.workers()))
-        if bench.queue.waiting():
+        if bench.queue.waiting_tasks():
             taken.append(bench.take())
         return seen
 
     monkeypatch.setattr(feed, "ready_tasks", beside)
     bench.controller._reconcile_queue()
-    assert len(taken) == 1 and bench.queue.waiting() == set(), "the worker's task waits a second time"
+    assert len(taken) == 1 and bench.queue.waiting_tasks() == set(), "the worker's task waits a second time"
 
 
 def test_a_check_queued_meanwhile_is_queued_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -296,7 +296,7 @@ def test_a_check_queued_meanwhile_is_queued_once(bench: Bench, monkeypatch: pyte
     bench.services.index.live.set_asset_waiting([asset.digest], queued=False)
     monkeypatch.setattr(MemoryQueue, "leases", lambda _: [])
     bench.controller._reconcile_queue()
-    assert bench.queue.waiting() == set(), "the worker's check waits a second time"
+    assert bench.queue.waiting_tasks() == set(), "the worker's check waits a second time"
 
 
 def test_an_upload_is_checked_and_what_was_found_is_indexed(bench: Bench) -> None:
@@ -322,7 +322,7 @@ def test_a_check_that_failed_is_told_and_tried_again(bench: Bench) -> None:
     with pytest.raises(ConflictError, match="the planner lost its way"):
         job_actions.submit(bench.services, request(hand="upload"))
     assert differences(bench.services.index, bench.services.store) == []
-    until(lambda: bench.controller.round() or bench.queue.waiting(), "tried again")
+    until(lambda: bench.controller.run_round() or bench.queue.waiting_tasks(), "tried again")
 
 
 def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> None:
@@ -330,16 +330,16 @@ def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> 
     delivery = bench.take()
     bench.queue._held.clear()
     bench.pass_time(LOST_AFTER_S - 1)
-    assert bench.queue.waiting() == set()
+    assert bench.queue.waiting_tasks() == set()
     bench.queue._held[delivery.key] = delivery
     bench.pass_time(LOST_AFTER_S + 1, beating=delivery)
-    assert bench.queue.waiting() == set()
+    assert bench.queue.waiting_tasks() == set()
 
 
 def test_files_below_an_asset_do_not_stop_a_controller(bench: Bench) -> None:
     (digest, *_) = [digest for kind, digest in stored_assets(bench.services.store) if kind is AssetKind.OBJECT]
     bench.services.store.put(names.object_pieces_key(digest, "32"), b"pieces")
-    bench.controller.round()
+    bench.controller.run_round()
     assert differences(bench.services.index, bench.services.store) == []
 
 
@@ -349,10 +349,10 @@ def test_an_index_lost_whole_is_made_again_from_the_store(bench: Bench) -> None:
     bench.pass_time(1)
     fresh = empty_index(f"sqlite:///{bench.services.settings.data_dir / 'fresh.sqlite'}")
     bench = Bench(Services(bench.services.settings, bench.services.store, fresh, bench.queue))
-    bench.controller.round()
-    waiting = len(bench.queue.waiting())
+    bench.controller.run_round()
+    waiting = len(bench.queue.waiting_tasks())
     bench.pass_time(LOST_AFTER_S + 2)
-    assert len(bench.queue.waiting()) == waiting == 2, "what was in the queue is not queued twice"
+    assert len(bench.queue.waiting_tasks()) == waiting == 2, "what was in the queue is not queued twice"
     bench.work_off()
     assert fresh.jobs.get(job.id).state is State.SUCCEEDED
     assert differences(fresh, bench.services.store) == []
@@ -386,7 +386,7 @@ def test_the_window_is_refilled_as_it_empties(bench: Bench) -> None:
     job, _ = job_actions.submit(bench.services, request(grasps=32 * 12))
     deepest = 0
     while (delivery := bench.queue.take("w")) is not None:
-        deepest = max(deepest, len(bench.queue.waiting()) + 1)
+        deepest = max(deepest, len(bench.queue.waiting_tasks()) + 1)
         bench.do(delivery)
         bench.pass_time(1)
     assert deepest == 4
@@ -411,7 +411,7 @@ def test_the_loop_outlives_parts_that_are_away(services: Services, monkeypatch: 
         raise (QueueUnavailable("away"), KeyError("a bug"))[rounds % 2]
 
     controller = Controller(services)
-    monkeypatch.setattr(controller, "round", failing)
+    monkeypatch.setattr(controller, "run_round", failing)
     # What goes on beside the rounds ends by it.
     monkeypatch.setattr(stop, "wait", lambda seconds: stop.is_set())
     controller.run(stop)

@@ -19,7 +19,7 @@ from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.deletion import GarbageCollector, delete_asset, delete_dataset, delete_job, restore
 from graspd.service.store.library import publish_asset
-from graspd.service.store.records import deletions, pending_deletions
+from graspd.service.store.records import pending_deletions, restorable_deletions
 from tests.fakes import OBJECT_FILES, finish, plan_all, record_of, request, with_settings
 from tests.service.pipeline.datasets.makers import add_asset, done, fail
 
@@ -56,7 +56,7 @@ def test_a_deleted_job_is_gone_and_its_shards_after_a_grace_time(services: Servi
     with pytest.raises(NotFoundError):
         services.index.jobs.get(job)
     assert differences(services.index, services.store) == [], "an index made anew knows it as little"
-    assert not GarbageCollector(services).advance()
+    assert not GarbageCollector(services).execute_deletions()
     assert keys(services, "jobs", "tasks", "deletions") == set()
     assert differences(services.index, services.store) == []
     assert not GarbageCollector(services).collect()
@@ -75,7 +75,7 @@ def test_a_deleted_job_may_be_submitted_again(services: Services) -> None:
     with pytest.raises(ConflictError, match="still being removed"):
         job_actions.submit(services, request())
     assert names.job_record_key(job) in keys(services, "jobs")
-    GarbageCollector(services).advance()
+    GarbageCollector(services).execute_deletions()
     again, new = job_actions.submit(services, request())
     assert (again.id, new, again.state) == (job, True, State.SUCCEEDED)
     assert not graceless(services).collect(budget_s=60)
@@ -145,7 +145,7 @@ def test_a_deleted_object_frees_its_name_and_its_files(services: Services) -> No
     assert differences(services.index, services.store) == []
     with pytest.raises(ConflictError, match="still being removed"):
         publish_asset(services.store, AssetKind.OBJECT, "ball", OBJECT_FILES)
-    GarbageCollector(services).advance()
+    GarbageCollector(services).execute_deletions()
     assert keys(services, f"assets/object/{digest}", "deletions") == set()
     assert publish_asset(services.store, AssetKind.OBJECT, "orb", OBJECT_FILES).name == "orb"
 
@@ -182,7 +182,7 @@ def test_the_next_controller_carries_out_a_broken_deletion(
     while keys(services, "deletions"):
         with monkeypatch.context() as patch, pytest.raises((KeyboardInterrupt, StopIteration)):
             patch.setattr(type(services.store), "delete", _after(place, real))
-            if not GarbageCollector(services).advance():
+            if not GarbageCollector(services).execute_deletions():
                 raise StopIteration
         place += 1
     assert differences(services.index, services.store) == []
@@ -193,9 +193,9 @@ COLLECTED = pytest.mark.parametrize("collected", [False, True], ids=["at once", 
 
 
 def collect_garbage(services: Services) -> None:
-    while GarbageCollector(services).advance():
+    while GarbageCollector(services).execute_deletions():
         pass
-    GarbageCollector(services).advance()
+    GarbageCollector(services).execute_deletions()
 
 
 def all_shown(services: Services) -> object:
@@ -217,10 +217,10 @@ def test_what_was_deleted_is_restored_as_it_was(services: Services, what: Any, c
     assert all_shown(services) != before
     if collected:
         collect_garbage(services)
-    restore(services, what, deletions(services.store, what)[0].id, permit=lambda _: None)
+    restore(services, what, restorable_deletions(services.store, what)[0].id, permit=lambda _: None)
     assert all_shown(services) == before
-    assert not deletions(services.store)
-    assert not GarbageCollector(services).advance()
+    assert not restorable_deletions(services.store)
+    assert not GarbageCollector(services).execute_deletions()
     assert differences(services.index, services.store) == []
 
 
@@ -240,7 +240,7 @@ def test_what_was_made_again_is_not_written_over(services: Services, what: Any) 
     ANOTHER[what](services)
     before = {key: services.store.get(key) for key in keys(services, "assets", "datasets", "tags")}
     with pytest.raises(ConflictError, match=r"there is .* '.*' (again|now); delete that first"):
-        restore(services, what, deletions(services.store, what)[0].id, permit=lambda _: None)
+        restore(services, what, restorable_deletions(services.store, what)[0].id, permit=lambda _: None)
     assert {key: services.store.get(key) for key in before} == before
 
 

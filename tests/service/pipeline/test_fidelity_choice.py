@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from graspd.service.model.errors import InputError
-from graspd.service.model.records import Choice
+from graspd.service.model.records import FidelityChoice
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
@@ -115,7 +115,7 @@ def test_a_job_in_a_scene_is_chosen_by_the_chart_of_its_scene(services: Services
     )
     wanted = request(fidelity="auto", target="lift>=0.84", scene="table")
     job, _ = job_actions.submit(services, wanted)
-    choice = Choice(target="lift>=0.84", chart=key, measured_on="all", reached=0.875)
+    choice = FidelityChoice(target="lift>=0.84", chart=key, measured_on="all", reached=0.875)
     assert (job.request.fidelity, job.request.target, job.choice) == ("standard", "", choice)
     assert record_of(services, job.id).choice == choice
     assert job_actions.submit(services, wanted.model_copy(update={"scene": "bin"}))[0].request.fidelity == "fine"

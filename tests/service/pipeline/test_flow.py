@@ -49,7 +49,7 @@ def _event(delivery: Delivery, kind: EventKind) -> Event:
 @pytest.fixture
 def controller(services: Services) -> Controller:
     made = Controller(services, clock=Clock())
-    made.round()
+    made.run_round()
     return made
 
 
@@ -57,7 +57,7 @@ def test_the_next_stage_is_queued_without_waiting_for_a_sweep(services: Services
     job_actions.submit(services, request(scenes=2))
     (first,) = taken(services)
     finish(services, first)
-    controller.round()
+    controller.run_round()
     assert [delivery.message.stage for delivery in taken(services)] == [Stage.SCENE]
 
 
@@ -65,11 +65,11 @@ def test_what_runs_is_not_queued_and_many_ends_are_one_round(services: Services,
     job, _ = job_actions.submit(services, request(grasps=32 * 40), priority=Priority.BULK)
     held = taken(services)
     finish(services, held[0])
-    controller.round()
-    assert services.queue.waiting() == set()
+    controller.run_round()
+    assert services.queue.waiting_tasks() == set()
     for delivery in held[1:]:
         finish(services, delivery)
-    controller.round()
+    controller.run_round()
     done = services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 40)
 
@@ -80,14 +80,14 @@ def test_progress_of_a_task_reaches_the_index_and_goes(services: Services, contr
     busy = replace(beat_of("w0"), task_id=held.message.task_id)
     services.queue._workers["w0"] = replace(busy, done=3.0, total=4.0, message="descending")
     controller._clock.now += 1.0
-    controller.round()
+    controller.run_round()
     (task,) = services.index.jobs.tasks(job=job.id).items
     assert (task.done, task.total, task.message) == (3.0, 4.0, "descending")
     finish(services, held)  # and its worker has not said so yet
     services.queue._workers["w0"] = replace(busy, done=4.0, total=4.0, message="late")
     for _ in range(2):
         controller._clock.now += 1.0
-        controller.round()
+        controller.run_round()
     (task,) = services.index.jobs.tasks(job=job.id).items
     assert task.state is State.SUCCEEDED and task.message != "late"
 
@@ -98,11 +98,11 @@ def test_a_fleet_larger_than_the_window_finds_work(services: Services) -> None:
     can = {"stages": (Stage.SYNTHESIZE,), "schemas": own.schemas, "revisions": dict(own.revisions)}
     services.queue._workers.update({name: beat_of(name, **can) for name in map(str, range(20))})
     controller = Controller(small, clock=(clock := Clock()))
-    controller.round()
+    controller.run_round()
     job_actions.submit(small, request(grasps=32 * 100), priority=Priority.BULK)
     clock.now += 1.0
-    controller.round()
-    assert len(services.queue.waiting()) == 40
+    controller.run_round()
+    assert len(services.queue.waiting_tasks()) == 40
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def work_off(services: Services, controller: Controller) -> WorkOff:
         while services.index.write.partly_entered_jobs():
             before = entered(services)
             controller._clock.now += 10.0
-            controller.round()
+            controller.run_round()
             turns.append((controller._entered, entered(services) - before))
         return turns
 

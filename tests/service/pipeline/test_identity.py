@@ -41,7 +41,7 @@ def test_a_second_service_on_a_store_is_refused(first: Services, tmp_path: Path)
     for _ in range(2):
         with pytest.raises(BusyError, match=r"belongs to another graspd service.*a store of its own.*index rebuild"):
             identify(second)
-    assert second.queue.service() is None
+    assert second.queue.service_id() is None
 
 
 def test_a_second_service_on_a_redis_is_refused_also_at_once(first: Services, tmp_path: Path) -> None:
@@ -49,36 +49,36 @@ def test_a_second_service_on_a_redis_is_refused_also_at_once(first: Services, tm
     for take_over in (False, False, True):
         with pytest.raises(BusyError, match=r"Redis belongs to another graspd service.*GRASPD_REDIS_URL"):
             identify(second, take_over=take_over)
-    queue = Mock(first.queue, service=Mock(side_effect=[None, first.queue.service()]))
+    queue = Mock(first.queue, service=Mock(side_effect=[None, first.queue.service_id()]))
     with pytest.raises(BusyError, match="Redis belongs to another"):
         identify(service(tmp_path / "third", queue=queue))
 
 
 def test_a_worker_or_an_index_of_another_store_is_refused(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second")
-    assert not check_service(second.store, second.queue.service())
-    assert check_service(first.store, first.queue.service())
+    assert not check_service(second.store, second.queue.service_id())
+    assert check_service(first.store, first.queue.service_id())
     with pytest.raises(BusyError, match="Redis belongs to another"):
-        check_service(second.store, first.queue.service())
+        check_service(second.store, first.queue.service_id())
     identify(second)
     mixed = Services(first.settings, first.store, second.index, MemoryQueue())
-    with pytest.raises(BusyError, match="the index belongs to another graspd service"):
+    with pytest.raises(BusyError, match="the index belongs to another graspd service_id"):
         identify(mixed)
 
 
 def test_processes_that_begin_a_service_at_once_agree(tmp_path: Path) -> None:
     one = service(tmp_path)
     other = Services(one.settings, one.store, Index(one.settings.resolved_index_url), one.queue)
-    assert identify(one) == identify(other) == one.queue.service()
-    assert identify(one, take_over=True) == one.queue.service(), "a rebuild of its own index"
+    assert identify(one) == identify(other) == one.queue.service_id()
+    assert identify(one, take_over=True) == one.queue.service_id(), "a rebuild of its own index"
     assert len(service_ids(one.store)) == 1
 
 
 def test_a_lost_redis_or_index_becomes_the_services_again(first: Services, tmp_path: Path) -> None:
     emptied = Services(first.settings, first.store, first.index, MemoryQueue())
-    assert identify(emptied) == emptied.queue.service() == first.queue.service()
+    assert identify(emptied) == emptied.queue.service_id() == first.queue.service_id()
     other = service(tmp_path / "other", store=first.store, queue=first.queue)
-    assert identify(other) == first.index.notes.service() == other.index.notes.service()
+    assert identify(other) == first.index.notes.service_id() == other.index.notes.service_id()
 
 
 def test_a_data_folder_remembers_its_service(tmp_path: Path) -> None:
@@ -94,12 +94,12 @@ def test_a_data_folder_remembers_its_service(tmp_path: Path) -> None:
 def test_a_store_in_the_data_folder_is_that_folders_own(first: Services, tmp_path: Path) -> None:
     """As it is after `cp -r` of the store, or where everything but the store was removed."""
     shutil.copytree(first.settings.data_dir / "store", tmp_path / "moved" / "store")
-    assert identify(service(tmp_path / "moved")) == first.index.notes.service()
+    assert identify(service(tmp_path / "moved")) == first.index.notes.service_id()
 
 
 def test_a_first_start_that_was_killed_half_way_goes_on(tmp_path: Path) -> None:
     begun = service(tmp_path)
-    begun.index.notes.name_service("begun")
+    begun.index.notes.set_service_id("begun")
     assert identify(begun) == "begun" == service_ids(begun.store)[-1]
 
 
@@ -114,10 +114,10 @@ def test_a_second_store_under_one_index_is_refused(first: Services, tmp_path: Pa
 def test_a_service_that_takes_over_is_the_only_one_from_then_on(first: Services, tmp_path: Path) -> None:
     second = service(tmp_path / "second", store=first.store)
     mine = identify(second, take_over=True)
-    assert identify(second) == mine == second.queue.service()
+    assert identify(second) == mine == second.queue.service_id()
     with pytest.raises(BusyError, match=r"was taken over by another graspd service.*index rebuild"):
         identify(first)
-    assert identify(first, take_over=True) == first.queue.service() != mine
+    assert identify(first, take_over=True) == first.queue.service_id() != mine
     with pytest.raises(BusyError, match="was taken over"):
         identify(second)
 
@@ -125,17 +125,17 @@ def test_a_service_that_takes_over_is_the_only_one_from_then_on(first: Services,
 def test_a_controller_ends_when_its_store_is_taken_over(first: Services, tmp_path: Path) -> None:
     now = [0.0]
     controller = Controller(first, clock=lambda: now[0])
-    controller.round()
+    controller.run_round()
     identify(service(tmp_path / "second", store=first.store), take_over=True)
     now[0] += 60.0
     with pytest.raises(BusyError, match="was taken over"):
-        controller.round()
+        controller.run_round()
 
 
 def test_what_is_forged_in_redis_stops_no_controller(first: Services) -> None:
-    first.queue.set_service("forged", instead=True)
-    Controller(first).round()
-    assert first.queue.service() == first.index.notes.service()
+    first.queue.set_service_id("forged", instead=True)
+    Controller(first).run_round()
+    assert first.queue.service_id() == first.index.notes.service_id()
 
 
 #: Longer than any test: no lease runs out on a busy machine.

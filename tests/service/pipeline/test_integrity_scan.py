@@ -29,7 +29,7 @@ from graspd.service.pipeline.integrity import (
     MISSING,
     NO_MANIFEST,
     IntegrityScan,
-    Interrupted,
+    ScanInterrupted,
     examine,
     repair,
     scan,
@@ -272,7 +272,7 @@ def test_it_makes_way_for_a_verify_and_goes_on_afterwards(services: Services, sh
     scan = IntegrityScan(services, stop, clock=stop.clock)
     assert services.index.notes.pause_scan(15.0, begin=True)
     stop.now += 10.0
-    with pytest.raises(Interrupted):
+    with pytest.raises(ScanInterrupted):
         scan.advance()
     assert not services.index.notes.pause_scan(15.0, begin=True)
     assert services.index.notes.pause_scan(0.0)

@@ -28,7 +28,7 @@ def test_the_same_request_is_the_same_job(services: Services) -> None:
     for hand in ("gripper", digest):
         again, new = job_actions.submit(services, request(hand=hand))
         assert (again.id, again.created, new) == (first.id, first.created, False)
-    assert len(services.queue.waiting()) == 1
+    assert len(services.queue.waiting_tasks()) == 1
 
 
 def test_an_unknown_hand_or_a_lost_redis_leaves_nothing_behind(
@@ -47,7 +47,7 @@ def test_an_unknown_hand_or_a_lost_redis_leaves_nothing_behind(
 
 def test_a_large_job_fills_the_window_and_no_more(services: Services) -> None:
     job, _ = job_actions.submit(with_settings(services, queue_window=10), request(grasps=3200))
-    assert len(services.queue.waiting()) == 10
+    assert len(services.queue.waiting_tasks()) == 10
     assert job.priority is Priority.BULK and job.stages[0].tasks == 100
 
 
@@ -57,7 +57,7 @@ def test_a_cancelled_job_leaves_the_queue(services: Services) -> None:
     finish(services, job.id, batches=1)
     after = job_actions.cancel(services, job.id)
     assert after.state is State.CANCELLED and (after.stages[0].succeeded, after.stages[0].cancelled) == (1, 1)
-    assert services.queue.waiting() == set()
+    assert services.queue.waiting_tasks() == set()
     assert [event.what for event in job_events(services.store, job.id)] == ["cancelled"]
 
 
@@ -113,7 +113,7 @@ def states(services: Services, job: JobRecord) -> dict[tuple[int, Stage], State]
 
 def test_scenes_are_made_before_grasps_and_told_in_that_order(services: Services) -> None:
     job = submit(services, grasps=64, views=1)
-    assert len(services.queue.waiting()) == 2, "the scenes of both batches"
+    assert len(services.queue.waiting_tasks()) == 2, "the scenes of both batches"
     told = services.index.jobs.get(job.id).stages
     order = (Stage.SCENE, Stage.SYNTHESIZE, Stage.RENDER)
     assert [(stage.stage, stage.tasks) for stage in told] == [(stage, 2) for stage in order]

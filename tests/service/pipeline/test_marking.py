@@ -21,7 +21,7 @@ from graspd.service.index.rebuild import differences
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import IndexUnavailable
-from graspd.service.model.planning import message_of, plan_tasks
+from graspd.service.model.planning import create_task_message, plan_tasks
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline import controller, job_actions, tagging
 from graspd.service.pipeline.backends import Services
@@ -52,10 +52,10 @@ def in_service(folder: Path, act: Callable[[Services], object] = lambda services
     """A controller starts, a user does something, the controller stops; how the index then differs from the store."""
     with closing(open_services(Settings(data_dir=folder))) as services:
         working = controller.Controller(services)
-        working.round()
+        working.run_round()
         add_assets(services)
         act(services)
-        working.round()
+        working.run_round()
         stop = threading.Event()
         stop.set()
         working.run(stop)
@@ -69,7 +69,7 @@ def submit(seed: int) -> Callable[[Services], object]:
 def make_first_shard(services: Services) -> None:
     record = record_of(services, services.index.jobs.page().items[0].id)
     task = next(plan_tasks(record))
-    make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3))
+    make_shard(services.store, create_task_message(record, task, attempt=1, max_attempt=3))
     done = Event(kind=EventKind.FINISHED, at=timestamp(), task_id=task.id, stage=task.stage, output=task.output)
     services.queue.publish(done)
 
@@ -130,11 +130,11 @@ def test_an_index_exchanged_meanwhile_is_made_anew(tmp_path: Path, rebuilt: list
     in_service(data, submit(2))
     services = open_services(Settings(data_dir=data))
     working = controller.Controller(services)
-    working.round()
+    working.run_round()
     for file in data.glob("index.sqlite*"):
         file.unlink()
     copy_index(backup, data)
-    working.round()
+    working.run_round()
     assert len(services.index.jobs.page().items) == 2
     services.close()
 

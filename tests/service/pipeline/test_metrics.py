@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from sqlalchemy.dialects import sqlite
 
-from graspd.api.metrics import Metrics, Snapshot
+from graspd.api.metrics import Metrics, MetricsSnapshot
 from graspd.service.index.notes import Damage
 from graspd.service.index.queries import overview
 from graspd.service.model.clock import timestamp
@@ -49,11 +49,11 @@ def test_no_read_of_the_index_for_metrics_scans_a_table(tmp_path: Path, query: A
 
 
 def test_damage_of_the_store_is_told(services: Services) -> None:
-    assert overview.read_index(services.index.database).damaged == 0
+    assert overview.read_index_status(services.index.database).damaged == 0
     services.index.damage.update([Damage("shards/base/a.h5", "its file is missing", "a")])
-    assert overview.read_index(services.index.database).damaged == 1
-    shown = Snapshot()
-    shown.add_index(overview.read_index(services.index.database))
+    assert overview.read_index_status(services.index.database).damaged == 1
+    shown = MetricsSnapshot()
+    shown.add_index(overview.read_index_status(services.index.database))
     assert b"graspd_store_damaged 1.0" in Metrics().render(shown)
 
 
@@ -61,7 +61,7 @@ def test_unfinished_jobs_and_the_latest_yield_are_told(services: Services) -> No
     submit(services, request(grasps=32))
     manifest = make_shard(services.store, message_for())
     services.index.write.add_manifests([manifest])
-    found = overview.read_index(services.index.database)
+    found = overview.read_index_status(services.index.database)
     assert found.jobs[State.QUEUED] == 1
     assert 0 <= found.oldest_s[State.QUEUED] < 60
     assert found.grasps_per_s == pytest.approx(manifest.count / 60)
@@ -95,7 +95,7 @@ def test_the_cost_of_a_look_does_not_grow_with_the_queue(rq_queue: RqQueue) -> N
 
 def test_sums_outlive_the_process_that_counts(rq_queue: RqQueue) -> None:
     for _ in range(2):
-        tally = Tally(rq_queue.count)
+        tally = Tally(rq_queue.add_to_counters)
         tally.add("graspd_jobs_ended_total", "succeeded")
         tally.flush()
         tally.flush()

@@ -27,7 +27,7 @@ from graspd.service.run import commands, store_commands
 from graspd.service.store import packs
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard, publish_shard, shard_exists
-from graspd.service.store.packs import has_packs, unpack_all
+from graspd.service.store.packs import convert_packs, has_packs
 from graspd.service.store.store import Store, open_store
 from tests.damage import flipped, overwrite
 from tests.fakes import job_record, make_shard, record_of, request, tasks_of
@@ -92,7 +92,7 @@ def is_whole(services: Services, job: str) -> bool:
 def test_a_controller_takes_packs_apart_when_it_starts(services: Services) -> None:
     job, tasks = submit(services, 3)
     pack(services.store, tasks)
-    Bench(services).controller.round()
+    Bench(services).controller.run_round()
     assert not has_packs(services.store)
     assert is_whole(services, job)
     assert not services.index.jobs.attempts(job=job)
@@ -100,7 +100,7 @@ def test_a_controller_takes_packs_apart_when_it_starts(services: Services) -> No
 
 def test_what_a_worker_of_0_2_packs_meanwhile_is_found(services: Services) -> None:
     bench = Bench(services)
-    bench.controller.round()
+    bench.controller.run_round()
     job, tasks = submit(services, 3)
     in_hand = [bench.take() for _ in tasks]
     bench.pass_time(1)
@@ -110,14 +110,14 @@ def test_what_a_worker_of_0_2_packs_meanwhile_is_found(services: Services) -> No
     bench.pass_time(6)
     assert not has_packs(services.store)
     assert is_whole(services, job)
-    assert (services.index.jobs.attempts(job=job), services.queue.waiting()) == ([], set())
+    assert (services.index.jobs.attempts(job=job), services.queue.waiting_tasks()) == ([], set())
 
 
 def test_what_is_harmed_in_a_pack_is_made_again(services: Services) -> None:
     job, tasks = submit(services, 2)
     key = pack(services.store, tasks)
     overwrite(services.store, key, flipped(services.store.get(key), len(services.store.get(key)) - 200))
-    Bench(services).controller.round()
+    Bench(services).controller.run_round()
     found = findings(services)
     assert [wrong.shard for wrong in found] == [tasks[1].output]
     assert repair(services, found) == (found, [])
@@ -169,7 +169,7 @@ def test_what_was_in_a_pack_has_a_file_of_its_own(store: Store) -> None:
     messages = batches(3)
     pack(store, messages)
     assert has_packs(store)
-    found = list(unpack_all(store))
+    found = list(convert_packs(store))
     assert not has_packs(store)
     assert [manifest.shard_id for manifest in found] == [message.output for message in messages]
     for message, manifest in zip(messages, found, strict=True):
@@ -178,7 +178,7 @@ def test_what_was_in_a_pack_has_a_file_of_its_own(store: Store) -> None:
         assert load_shard(store, Stage.SYNTHESIZE, message.output).attributes["batch"] == message.batch
         assert load_manifest(store, Stage.SYNTHESIZE, message.output) == manifest
         assert (manifest.key, manifest.batches) == (wanted.key, 1)
-    assert list(unpack_all(store)) == []
+    assert list(convert_packs(store)) == []
 
 
 @pytest.mark.parametrize("breaks_at", range(1, 8))
@@ -201,8 +201,8 @@ def test_it_may_break_off_and_is_continued(tmp_path: Path, monkeypatch: pytest.M
         for name in ("put", "delete"):
             patch.setattr(Store, name, breaking(getattr(Store, name)))
         with pytest.raises(StoreUnavailable):
-            list(unpack_all(store))
-    list(unpack_all(store))
+            list(convert_packs(store))
+    list(convert_packs(store))
     assert there(store, messages) == [True, False, True]
     assert not has_packs(store)
     for message in (messages[0], messages[2]):
@@ -215,7 +215,7 @@ def test_a_file_of_its_own_counts_before_one_in_a_pack(store: Store) -> None:
     manifest, data = made_of(message, worker="first")
     publish_shard(store, manifest, data)
     pack(store, [message], worker="second")
-    assert list(unpack_all(store)) == [manifest]
+    assert list(convert_packs(store)) == [manifest]
     assert load_manifest(store, Stage.SYNTHESIZE, message.output).worker == "first"
 
 
@@ -224,10 +224,10 @@ def test_harm_moves_the_pack_aside_and_costs_no_more(store: Store, place: str) -
     messages = batches(2)
     key = pack(store, messages)
     data = store.get(key)
-    body, rows = packs._directory(key, data)
+    body, rows = packs._read_directory(key, data)
     at = {"directory": 40, "manifest": body + rows[0].manifest_start + 10, "file": body + rows[0].start + 50}
     overwrite(store, key, data[: body + rows[1].start - 1] if place == "end" else flipped(data, at[place]))
-    list(unpack_all(store))
+    list(convert_packs(store))
     assert store.exists(f"damaged/{key}")
     assert not has_packs(store)
     wanted = {"directory": [False, False], "manifest": [False, True], "file": [True, True], "end": [True, True]}[place]

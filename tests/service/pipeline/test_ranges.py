@@ -13,8 +13,8 @@ from pydantic import ValidationError
 
 from graspd.service.index.changes.records import Changes
 from graspd.service.index.rebuild import differences
-from graspd.service.model.messages import FIRST_SCHEMA, Requirements, WorkerBeat, capabilities
-from graspd.service.model.planning import needed_schema
+from graspd.service.model.messages import FIRST_SCHEMA, Requirements, WorkerHeartbeat, capabilities
+from graspd.service.model.planning import required_schema
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import SCHEMA_OF_RANGES, STAGE_REVISIONS, TASK_SCHEMA
@@ -35,7 +35,9 @@ REVISION = OWN.revisions["synthesize"]
 NEED = Requirements(Stage.SYNTHESIZE, OWN.schemas[0], OWN.schemas[1], REVISION)
 
 
-def beat(schemas: tuple[int, int] = OWN.schemas, revision: int = REVISION, stage: Stage = NEED.stage) -> WorkerBeat:
+def beat(
+    schemas: tuple[int, int] = OWN.schemas, revision: int = REVISION, stage: Stage = NEED.stage
+) -> WorkerHeartbeat:
     return beat_of(stages=(stage,), schemas=schemas, revisions={**OWN.revisions, "synthesize": revision})
 
 
@@ -54,7 +56,7 @@ NEXT = beat(revision=REVISION + 1)
         ([beat(schemas=(4, 9))], replace(NEED, schema=2, newest=5), Route()),
     ],
 )
-def test_a_task_goes_where_able_workers_look(present: list[WorkerBeat], need: Requirements, place: Route) -> None:
+def test_a_task_goes_where_able_workers_look(present: list[WorkerHeartbeat], need: Requirements, place: Route) -> None:
     assert Routes(present).route_of(need) == place
 
 
@@ -67,24 +69,26 @@ def test_a_task_goes_where_able_workers_look(present: list[WorkerBeat], need: Re
         ([beat(schemas=(5, 6))], replace(NEED, newest=4), "has at most schema 4"),
     ],
 )
-def test_what_nobody_can_do_is_held_with_the_reason(present: list[WorkerBeat], need: Requirements, why: str) -> None:
+def test_what_nobody_can_do_is_held_with_the_reason(
+    present: list[WorkerHeartbeat], need: Requirements, why: str
+) -> None:
     assert why in Routes(present).route_of(need).held
 
 
 def test_a_task_asks_for_the_schema_of_its_newest_field() -> None:
     since = {"friction": 3, "touch": 4}
-    assert needed_schema(request(), since) == OWN.schemas[0]
-    assert needed_schema(request(friction=0.5), since) == 3
-    assert needed_schema(request(friction=0.5, fidelity="draft"), {**since, "fidelity": 4}) == 4
+    assert required_schema(request(), since) == OWN.schemas[0]
+    assert required_schema(request(friction=0.5), since) == 3
+    assert required_schema(request(friction=0.5, fidelity="draft"), {**since, "fidelity": 4}) == 4
 
 
 def test_a_worker_that_does_not_say_what_it_can_is_given_no_task() -> None:
     now = beat()
     told = asdict(now)
-    assert entries.parse_entry(WorkerBeat, json.dumps(told).encode()) == now
+    assert entries.parse_entry(WorkerHeartbeat, json.dumps(told).encode()) == now
     for name in ("schemas", "revisions"):
         del told[name]
-    old = entries.parse_entry(WorkerBeat, json.dumps(told).encode())
+    old = entries.parse_entry(WorkerHeartbeat, json.dumps(told).encode())
     assert old is not None and Routes([old]).route_of(NEED).held
 
 
@@ -99,13 +103,13 @@ def test_tasks_that_wait_apart_are_seen_and_leave(rq_queue: RqQueue) -> None:
     name = f"rq:queue:{queue_name(Priority.BULK, Stage.SYNTHESIZE, NEED)}"
     assert rq_queue.enqueue([message], Priority.BULK, apart=True) == 1
     assert rq_queue.connection.llen(name) == 1
-    assert rq_queue.waiting() == {message.task_id}
+    assert rq_queue.waiting_tasks() == {message.task_id}
     assert rq_queue.depths()[Priority.BULK, Stage.SYNTHESIZE] == 1
     assert rq_queue.status(lease_s=6).depth[Priority.BULK, Stage.SYNTHESIZE] == 1
-    rq_queue.clear_untaken([beat(), NEXT])
-    assert rq_queue.waiting() == {message.task_id}
-    rq_queue.clear_untaken([NEXT])
-    assert rq_queue.waiting() == set()
+    rq_queue.remove_unserved_lists([beat(), NEXT])
+    assert rq_queue.waiting_tasks() == {message.task_id}
+    rq_queue.remove_unserved_lists([NEXT])
+    assert rq_queue.waiting_tasks() == set()
     assert list_names(rq_queue.connection) == list_names(rq_queue.connection)[:8]
     assert rq_queue.enqueue([message], Priority.BULK) == 1, "nothing of it is left"
 
@@ -124,11 +128,11 @@ def services(services: Services) -> Services:
     return with_settings(services, task_s=30.0)
 
 
-def worker(name: str = "w", *, device: str = "cpu", schemas: tuple[int, int] = (2, TASK_SCHEMA)) -> WorkerBeat:
+def worker(name: str = "w", *, device: str = "cpu", schemas: tuple[int, int] = (2, TASK_SCHEMA)) -> WorkerHeartbeat:
     return beat_of(name, device=device, schemas=schemas, revisions=dict(STAGE_REVISIONS))
 
 
-def here(services: Services, *workers: WorkerBeat) -> None:
+def here(services: Services, *workers: WorkerHeartbeat) -> None:
     services.queue._workers = {one.name: one for one in workers}  # type: ignore[attr-defined]
 
 
@@ -139,7 +143,7 @@ def measured(services: Services, seconds: float) -> None:
 
 
 def span(services: Services, grasps: int, priority: Priority = Priority.BULK, **changes: object) -> int:
-    return job_actions.prepare(services, request(grasps=grasps, **changes), priority=priority).span
+    return job_actions.prepare_job(services, request(grasps=grasps, **changes), priority=priority).span
 
 
 @given(st.integers(1, 40_000), st.integers(0, 5000), st.integers(0, 300))
@@ -199,7 +203,7 @@ def test_small_jobs_pictures_and_older_workers_go_batch_by_batch(services: Servi
     assert span(services, 3200, scenes=1) > 1
     here(services, worker("new"), worker("old", schemas=(2, SCHEMA_OF_RANGES - 1)))
     assert span(services, 3200) == 1
-    known = job_actions.prepare(services, request(grasps=3200, scenes=1, views=1))
+    known = job_actions.prepare_job(services, request(grasps=3200, scenes=1, views=1))
     with pytest.raises(ValidationError, match="pictures"):
         JobRecord.model_validate({**known.model_dump(mode="json"), "span": 2})
 
@@ -208,7 +212,7 @@ def test_rates_and_workers_are_read_once_for_many_jobs(services: Services) -> No
     here(services, worker())
     now = 0.0
     ranges = TaskRanges(services, clock=lambda: now)
-    job = job_actions.prepare(with_settings(services, task_s=0.0), request(grasps=3200), priority=Priority.BULK)
+    job = job_actions.prepare_job(with_settings(services, task_s=0.0), request(grasps=3200), priority=Priority.BULK)
     assert ranges.with_span(job).span == 4
     measured(services, 0.01)
     assert ranges.with_span(job).span == 4
@@ -218,9 +222,9 @@ def test_rates_and_workers_are_read_once_for_many_jobs(services: Services) -> No
 
 def test_a_job_of_ranges_goes_through_its_stages(services: Services) -> None:
     bench = Bench(services)
-    bench.controller.round()
+    bench.controller.run_round()
     here(services, worker())
-    job = job_actions.prepare(services, request(grasps=32 * 6 + 5, scenes=2), priority=Priority.BULK)
+    job = job_actions.prepare_job(services, request(grasps=32 * 6 + 5, scenes=2), priority=Priority.BULK)
     assert job.span == 4
     job_actions.enter_job(services, job)
     bench.work_off()
@@ -234,8 +238,8 @@ def test_a_job_of_ranges_goes_through_its_stages(services: Services) -> None:
 
 def test_large_shards_enter_the_index_in_short_turns(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(services)
-    bench.controller.round()
-    record = job_actions.prepare(services, request(grasps=32 * 64 * 5), priority=Priority.BULK)
+    bench.controller.run_round()
+    record = job_actions.prepare_job(services, request(grasps=32 * 64 * 5), priority=Priority.BULK)
     job, _ = job_actions.enter_job(services, record.model_copy(update={"span": 64}))
     turns: list[int] = []
     add = Changes.add_manifests

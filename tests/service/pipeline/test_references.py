@@ -13,7 +13,7 @@ from graspd.service.index.rebuild import differences
 from graspd.service.model import names
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, SceneError
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.planning import message_of, plan_tasks
+from graspd.service.model.planning import create_task_message, plan_tasks
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_NETWORKS
@@ -101,7 +101,7 @@ def test_what_is_named_is_needed_until_its_users_are_deleted(services: Services,
     delete_asset(services, named.kind, named.name)
     with pytest.raises(NotFoundError, match=f"there is no {named.kind.value} {named.name!r}"):
         named.submit(services)
-    while GarbageCollector(services).advance():
+    while GarbageCollector(services).execute_deletions():
         pass
     assert not list(services.store.list(f"{names.ASSETS}/network"))
 
@@ -109,7 +109,7 @@ def test_what_is_named_is_needed_until_its_users_are_deleted(services: Services,
 @BOTH
 def test_a_job_entered_while_it_is_deleted_is_not_kept(services: Services, named: Reference) -> None:
     named.add(services)
-    record = job_actions.prepare(services, request(**named.options))
+    record = job_actions.prepare_job(services, request(**named.options))
     delete_asset(services, named.kind, named.name)
     with pytest.raises(NotFoundError, match=rf"{named.kind.value} .* deleted just now"):
         job_actions.enter_job(services, record)
@@ -157,7 +157,9 @@ NO_NEIGHBOURS = ({"object": "cup"}, {"object": "../x", "digest": "a" * 32}, {"ob
 def test_a_forged_entry_needs_a_digest(services: Services, named: Reference, forged: dict[str, Any]) -> None:
     named.add(services)
     job = named.submit(services)
-    said = message_of(job, next(plan_tasks(job)), attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
+    said = create_task_message(job, next(plan_tasks(job)), attempt=1, max_attempt=3).model_dump(
+        mode="json", by_alias=True
+    )
     assert TaskMessage.model_validate(said).request == job.request
     with pytest.raises(ValidationError):
         TaskMessage.model_validate({**said, "request": {**said["request"], **forged}})
@@ -167,7 +169,7 @@ def test_a_forged_entry_needs_a_digest(services: Services, named: Reference, for
 def test_other_neighbours_or_another_order_are_other_scenes(services: Services, other: tuple[str, ...]) -> None:
     cup = add_cup(services)
     known = NEIGHBOUR.submit(services, neighbours=("cup", "ball"))
-    assert [one.digest for one in known.request.place.neighbours] == [cup, known.object_digest]
+    assert [one.digest for one in known.request.scene_spec.neighbours] == [cup, known.object_digest]
     assert next(plan_tasks(NEIGHBOUR.submit(services, neighbours=other))).output != next(plan_tasks(known)).output
 
 
@@ -175,7 +177,7 @@ def test_a_document_places_its_neighbours(services: Services) -> None:
     cup = add_cup(services)
     places = [{"object": "cup", "pose": [0.2, 0, 0, *UPRIGHT]}, {"object": "cup", "pose": [-0.2, 0, 0, *UPRIGHT]}]
     scene = {"supports": [FLOOR], "target": [0, 0, 0, *UPRIGHT], "neighbours": places}
-    found = NEIGHBOUR.submit(services, scene=scene, neighbours=()).request.place.neighbours
+    found = NEIGHBOUR.submit(services, scene=scene, neighbours=()).request.scene_spec.neighbours
     assert [one.pose and one.pose[0] for one in found] == [0.2, -0.2]
     assert {one.digest for one in found} == {cup}
 
@@ -245,7 +247,7 @@ def test_a_retried_job_sets_out_from_the_network_it_had(services: Services) -> N
 def test_workers_that_know_networks_are_asked_for_one_of_this_method(services: Services) -> None:
     add_network(services)
     jobs = NETWORK.submit(services), NETWORK.submit(services, method="fast_graspd", options={})
-    asked = [message_of(job, next(plan_tasks(job)), attempt=1, max_attempt=3).schema_ for job in jobs]
+    asked = [create_task_message(job, next(plan_tasks(job)), attempt=1, max_attempt=3).schema_ for job in jobs]
     assert asked == [SCHEMA_OF_NETWORKS, OLDEST_TASK_SCHEMA]
     job = NETWORK.submit(services, method="mine", options={"network": "what I call so"})
     assert job.request.options == {"network": "what I call so"} and len(job.assets) == 2

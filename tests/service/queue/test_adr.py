@@ -22,7 +22,7 @@ from rq.serializers import DefaultSerializer, JSONSerializer
 from rq.timeouts import BaseDeathPenalty
 from rq.worker import BaseWorker
 
-from graspd.api.metrics import Metrics, Snapshot
+from graspd.api.metrics import Metrics, MetricsSnapshot
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import TaskRefused, UnavailableError
 from graspd.service.model.states import Priority, Stage, State
@@ -32,7 +32,7 @@ from graspd.service.pipeline.controller import Controller
 from graspd.service.pipeline.indexer import Indexer
 from graspd.service.pipeline.leading import PART
 from graspd.service.pipeline.lease_reaper import LeaseReaper
-from graspd.service.queue.entries import TASK_FUNCTION, checked_job, held_key, queue_name
+from graspd.service.queue.entries import TASK_FUNCTION, lease_registry_key, queue_name, sanitized_job
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, cancel_key, rq_id, worker_key
 from tests.conftest import PACKAGES, REPOSITORY
@@ -72,7 +72,7 @@ def test_a_clock_that_is_ahead_takes_no_task_away(held: tuple[Services, Job], mo
     # RQ's own cleaning up, at that moment by that clock.
     registry.cleanup(timestamp=ahead)
     assert job.get_status() == "failed", "RQ calls it abandoned"
-    assert not registry.connection.exists(held_key(NAME))
+    assert not registry.connection.exists(lease_registry_key(NAME))
 
 
 def test_a_command_that_nobody_hears_is_lost_and_a_key_is_not(held: tuple[Services, Job]) -> None:
@@ -233,24 +233,24 @@ def test_a_forged_entry_stops_nothing(services: Services, what: str) -> None:
     now = [1000.0]
     controller = Controller(services, clock=lambda: now[0])
     queue: Any = services.queue
-    controller.round()
+    controller.run_round()
     queue.connection.zadd(WIP, {"b" * 32 + "-1:execution": 1})  # of a worker that died
     FORGERIES[what](queue.connection)
     for _ in range(8):
         now[0] += 2.0
         with contextlib.suppress(UnavailableError):  # a round may find a part out of order; it puts that right
-            controller.round()
-    controller.round()
+            controller.run_round()
+    controller.run_round()
     job, _ = job_actions.submit(services, request())
     (task,) = services.index.jobs.tasks(job=job.id).items
-    assert task.id in queue.waiting(), "feeding goes on"
+    assert task.id in queue.waiting_tasks(), "feeding goes on"
     assert queue.leases() == [], "what nobody holds is taken off"
     queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id=task.id, stage=Stage.SYNTHESIZE))
-    controller.round()
+    controller.run_round()
     assert services.index.jobs.get(job.id).state is State.RUNNING, "events are read"
     queue.discard([task.id])
-    assert task.id not in queue.waiting()
-    page = Snapshot()
+    assert task.id not in queue.waiting_tasks()
+    page = MetricsSnapshot()
     page.add_queue(queue.status(lease_s=6), is_kept=queue.is_announced(PART))
     page.add_sums(queue.counter_sums())
     assert b"graspd_workers" in Metrics().render(page)
@@ -265,7 +265,7 @@ def forge(queue: RqQueue, function: str, *args: Any, serializer: Any = JSONSeria
 
 def fetch(queue: RqQueue, job: str) -> Job:
     bulk = Queue("bulk-synthesize", connection=queue.connection, serializer=JSONSerializer)
-    return checked_job(Job.fetch(job, connection=queue.connection, serializer=JSONSerializer), bulk)
+    return sanitized_job(Job.fetch(job, connection=queue.connection, serializer=JSONSerializer), bulk)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from graspd.service.model.errors import QueueUnavailable
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.connection import connect
-from graspd.service.queue.entries import held_key, list_key, queue_name, queue_names
+from graspd.service.queue.entries import lease_registry_key, list_key, queue_name, queue_names
 from graspd.service.queue.port import BULK_EVERY, Event, EventKind
 from graspd.service.queue.rq_queue import EVENTS, LEAD, RqQueue, lease_state, register_worker, renew_lease, worker_key
 from graspd.worker.process.heartbeat import Heartbeat
@@ -137,7 +137,7 @@ def busy(queue: RqQueue, worker: Worker) -> Worker:
 
 def test_tasks_come_out_as_they_went_in(queue: RqQueue, worker: Worker) -> None:
     assert queue.enqueue([task(), task("b")], Priority.BULK) == 2
-    assert queue.waiting() == {"a", "b"}
+    assert queue.waiting_tasks() == {"a", "b"}
     assert queue.depths()[Priority.BULK, Stage.SYNTHESIZE] == 2
     assert worker.take() == task()
     worker.finish()
@@ -170,8 +170,8 @@ def test_a_lease_says_who_holds_which_attempt_of_what(queue: RqQueue, worker: Wo
     worker.take()
     (lease,) = queue.leases()
     assert (lease.task_id, lease.attempt) == ("a", 2)
-    assert queue.holder(lease) == ("w", task(attempt=2))
-    assert queue.waiting() == set()
+    assert queue.lease_holder(lease) == ("w", task(attempt=2))
+    assert queue.waiting_tasks() == set()
     worker.finish()
     assert queue.leases() == []
 
@@ -190,7 +190,7 @@ def test_a_lease_changes_with_each_beat_until_it_is_released(queue: RqQueue, bus
 def test_a_discarded_task_never_starts(queue: RqQueue, worker: Worker) -> None:
     queue.enqueue([task(), task("b")], Priority.BULK)
     queue.discard(["a"])
-    assert queue.waiting() == {"b"}
+    assert queue.waiting_tasks() == {"b"}
     assert worker.take() == task("b")
 
 
@@ -218,12 +218,12 @@ def test_events_come_once_in_order_and_again_if_not_acknowledged(queue: RqQueue)
 
 def test_any_number_of_readers_follow_the_stream(queue: RqQueue) -> None:
     queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id="j", message="queued"))
-    ((first_id, first),) = queue.tail("0", limit=9, wait_s=0)
+    ((first_id, first),) = queue.events_after("0", limit=9, wait_s=0)
     assert first.message == "queued"
-    assert queue.tail(first_id, limit=9, wait_s=0) == []
+    assert queue.events_after(first_id, limit=9, wait_s=0) == []
     queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id="j", message="running"))
-    assert [event.message for _, event in queue.tail(first_id, limit=9, wait_s=0)] == ["running"]
-    assert len(queue.tail("0", limit=9, wait_s=0)) == 2
+    assert [event.message for _, event in queue.events_after(first_id, limit=9, wait_s=0)] == ["running"]
+    assert len(queue.events_after("0", limit=9, wait_s=0)) == 2
 
 
 def test_a_part_is_there_as_long_as_it_says_so(queue: RqQueue) -> None:
@@ -262,7 +262,7 @@ def test_a_lease_that_is_none_keeps_nobody_from_leading(rq_queue: RqQueue, forge
 
 
 @pytest.mark.parametrize(
-    ("command", "ask"), [("smembers", RqQueue.waiting), ("set", lambda queue: queue.renew_leadership("a", 600))]
+    ("command", "ask"), [("smembers", RqQueue.waiting_tasks), ("set", lambda queue: queue.renew_leadership("a", 600))]
 )
 def test_what_redis_forbids_is_told(rq_queue: RqQueue, redis_server: str, command: str, ask: Any) -> None:
     rights = ["+@all", f"-{command}"]
@@ -273,8 +273,8 @@ def test_what_redis_forbids_is_told(rq_queue: RqQueue, redis_server: str, comman
 
 
 def test_sums_add_up_and_each_name_has_its_own(queue: RqQueue) -> None:
-    queue.count({"a": 1.5, "b": 2.0})
-    queue.count({"a": 1.0})
+    queue.add_to_counters({"a": 1.5, "b": 2.0})
+    queue.add_to_counters({"a": 1.0})
     assert queue.counter_sums() == {"a": 2.5, "b": 2.0}
 
 
@@ -326,10 +326,10 @@ def test_a_killed_worker_leaves_nothing_in_redis(rq_queue: RqQueue) -> None:
     worker = SimpleWorker(served, connection=rq_queue.connection, name="dead", serializer=JSONSerializer)
     worker.register_birth()
     one_beat(rq_queue.connection, "dead")
-    rq_queue.tidy()
+    rq_queue.remove_stale_keys()
     assert [beat.name for beat in rq_queue.workers()] == ["dead"], "it lives"
     rq_queue.connection.delete(worker_key("dead"))  # as its time to live does
-    rq_queue.tidy()
+    rq_queue.remove_stale_keys()
     assert [key for key in rq_queue.connection.keys("*") if b"worker" in key] == []
 
 
@@ -350,9 +350,9 @@ def cost_of_a_sweep(queue: RqQueue) -> int:
 
 
 def test_all_leases_are_read_in_one_round_trip(rq_queue: RqQueue) -> None:
-    rq_queue.connection.zadd(held_key(BULK), {"a-1:x": 1.0})
+    rq_queue.connection.zadd(lease_registry_key(BULK), {"a-1:x": 1.0})
     few = cost_of_a_sweep(rq_queue)
-    rq_queue.connection.zadd(held_key(BULK), {f"{number}-1:x": 1.0 for number in range(500)})
+    rq_queue.connection.zadd(lease_registry_key(BULK), {f"{number}-1:x": 1.0 for number in range(500)})
     assert len(rq_queue.leases()) == 501
     assert cost_of_a_sweep(rq_queue) == few
 
@@ -361,7 +361,7 @@ def test_tasks_are_added_together_and_none_twice(rq_queue: RqQueue) -> None:
     tasks = [task(f"{number:032x}") for number in range(700)]
     assert rq_queue.enqueue(tasks[:10], Priority.BULK) == 10
     assert rq_queue.enqueue(tasks, Priority.BULK) == 690
-    assert rq_queue.waiting() == {task.task_id for task in tasks}
+    assert rq_queue.waiting_tasks() == {task.task_id for task in tasks}
     assert sum(rq_queue.depths().values()) == 700
     rq_queue.connection.delete(list_key(BULK))
     assert rq_queue.enqueue(tasks, Priority.BULK) == 0, "what the queue knows is not added again"

@@ -14,7 +14,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.pinhole import pixel_rays
 from graspd.service.readers import Pictures, open_shards
 from graspd.service.readers.clouds import graspness
-from graspd.service.readers.depth_noise import NOISES, DepthNoise, noise_of, shadows
+from graspd.service.readers.depth_noise import NOISES, DepthNoise, parse_depth_noise, shadow_mask
 from graspd.service.store.shards import read_shard
 from tests.conftest import REPOSITORY
 from tests.service.readers import box_scenes
@@ -261,7 +261,7 @@ def test_what_the_second_eye_does_not_see_is_a_hole() -> None:
     depth = plane(0.8)
     depth[60:180, 140:200] = 0.4
     product = 330 * 0.048  # disparities of 19.8 and 39.6 px
-    hidden = shadows(depth, product)
+    hidden = shadow_mask(depth, product)
     wall, board = product / 0.8, product / 0.4
     rows = hidden[60:180]
     assert rows[:, 140:200].sum() == 0
@@ -303,5 +303,5 @@ def test_edges_bleed_and_pixels_on_them_fly_a_little() -> None:
 
 def test_an_unknown_camera_is_told_the_ones_there_are() -> None:
     with pytest.raises(InputError, match="stereo, structured_light, tof"):
-        noise_of("kinect")
-    assert noise_of(None) is None
+        parse_depth_noise("kinect")
+    assert parse_depth_noise(None) is None

@@ -22,11 +22,11 @@ from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_sh
 from graspd.service.readers.rows import RowTable
 from graspd.service.readers.trajectories import (
     Waypoint,
-    point_at,
     scene_spec_of,
     slider_positions,
     trajectory_of,
-    wrists_of,
+    waypoint_at,
+    wrist_angles,
 )
 from graspd.service.readers.where import compile_expression
 from graspd.service.settings import Settings
@@ -51,7 +51,7 @@ def folder(services: Services, shards: Shards, tmp_path: Path) -> Path:
 def test_a_job_in_a_store_is_read_valid_or_whole(services: Services, shards: Shards) -> None:
     assert [file.kind for file in shards] == ["base", "scene", "views"] * 2
     assert len(Grasps(shards, valid=False)) == GRASPS
-    bases = [read_shard(services.store.get(file.key), kind="base") for file in shards.of("base")]
+    bases = [read_shard(services.store.get(file.key), kind="base") for file in shards.of_kind("base")]
     valid = sum(int(np.count_nonzero(base["quality/valid"])) for base in bases)
     assert 0 < valid < GRASPS
     assert len(Grasps(shards)) == valid
@@ -118,7 +118,7 @@ def test_every_picture_is_there_once_with_its_grasps_in_the_camera_frame(folder:
     places = {(sample["shard_id"], sample["row"]) for sample in pictures}
     assert len(places) == len(pictures) == 2 * 2 * 2  # batches, scenes, views
     with pytest.raises(NotFoundError, match="not among"):
-        Pictures(Shards(shards.of("views")))
+        Pictures(Shards(shards.of_kind("views")))
 
 
 def test_the_newest_snapshot_of_a_dataset_is_read(services: Services, shards: Shards, tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def test_a_file_that_changed_is_refused_or_fetched_again(services: Services, sha
 
 
 def test_a_wrong_value_in_a_file_is_refused_and_not_handed_out(folder: Path) -> None:
-    file = open_shards(folder).of("base")[0]
+    file = open_shards(folder).of_kind("base")[0]
     assert file.path is not None
     data = file.path.read_bytes()
     file.path.write_bytes(flipped_values(data, read_shard(data)["grasp/hand_pose"]))
@@ -175,7 +175,7 @@ def test_what_was_read_once_from_s3_needs_the_server_no_more(s3_url: str, s3_ser
 def test_every_row_of_every_column_is_what_h5py_reads(box: Path) -> None:
     with h5py.File(box / "views.h5") as file:
         columns = [name for name in SCHEMAS["views"] if name in file]
-        table = RowTable.of(file, columns, "views")
+        table = RowTable.from_file(file, columns, "views")
         assert {"image/rgb", "image/depth"} <= set(table.packed) and "camera/eye" in table.held
         for row in range(len(file["camera/eye"])):
             found = table.row(box / "views.h5", row, columns)
@@ -197,7 +197,7 @@ def test_what_is_packed_in_another_way_is_read_by_the_library(tmp_path: Path) ->
         half = file.create_dataset("half", shape=values.shape, dtype="f4", **plain)
         half[1] = values[1]
     with h5py.File(tmp_path / "other.h5") as file:
-        table = RowTable.of(file, [*ways, "half"], "other")
+        table = RowTable.from_file(file, [*ways, "half"], "other")
     assert set(table.packed) == {"plain"}
     found = table.row(tmp_path / "other.h5", 1, ways)
     for name in ways:
@@ -210,7 +210,7 @@ def test_a_picture_whose_bytes_changed_is_refused_alone(box: Path, tmp_path: Pat
     shutil.copytree(box, tmp_path / "set")
     pictures, path = Pictures(open_shards(tmp_path / "set"), ["image/depth"]), tmp_path / "set" / "views.h5"
     with h5py.File(path) as file:
-        start, length = RowTable.of(file, ["image/depth"], "views").packed["image/depth"].places[2]
+        start, length = RowTable.from_file(file, ["image/depth"], "views").packed["image/depth"].places[2]
     data = bytearray(path.read_bytes())
     data[start + length // 2] ^= 0x10
     pictures[1]
@@ -273,13 +273,13 @@ def test_a_way_goes_from_standoff_or_pregrasp_to_lift_or_squeeze():
     assert all((point.joint_positions == -0.3).all() for point in way[:WAYPOINTS])
     assert way[-1].carried.tolist() == [0, 0, 0.1] and not any(point.carried.any() for point in way[:-1])
     np.testing.assert_allclose(slider_positions(way), [0, 0.25, 0.5, 0.75, 1, 2, 3, 4])
-    assert point_at(way, 3.5).carried == pytest.approx([0, 0, 0.05]), "half way up"
+    assert waypoint_at(way, 3.5).carried == pytest.approx([0, 0, 0.05]), "half way up"
 
 
 @pytest.mark.parametrize("at", [(-1, 0.2, -0.3), (0.375, 0.15, -0.3), (1.5, 0.1, 0.05), (9, 0.1, 0.2)])
 def test_between_two_postures_positions_and_joints_go_straight(at: tuple[float, float, float]):
     place, x, joint = at
-    point = point_at(trajectory_of(shard(in_scene=True), 0), place)
+    point = waypoint_at(trajectory_of(shard(in_scene=True), 0), place)
     assert point.hand_pose[0] == pytest.approx(x) and point.joint_positions == pytest.approx([joint, joint])
 
 
@@ -289,7 +289,7 @@ def test_a_turn_is_divided_evenly():
         Waypoint(name, np.concatenate([np.zeros(3), q]), np.zeros(0), np.zeros(3))
         for name, q in zip(("grasp", "squeeze"), ends, strict=True)
     )
-    third = point_at([first, last], 1 / 3).hand_pose[3:]
+    third = waypoint_at([first, last], 1 / 3).hand_pose[3:]
     assert third == pytest.approx(quat_from_axis_angle(np.array([0, 0, 1.0]), np.array(0.4)))
 
 
@@ -303,9 +303,9 @@ def test_a_shard_says_its_scene_or_none_and_nonsense_is_refused():
 
 def test_wrists_are_those_of_the_rows_asked_for():
     one = shard(in_scene=True)
-    assert wrists_of(one, np.array([0])) is None
+    assert wrist_angles(one, np.array([0])) is None
     one.arrays["grasp/wrist_positions"] = np.array([[0.1, 0.2], [0.3, 0.4]])
-    assert np.array_equal(wrists_of(one, np.array([1, 1])), [[0.3, 0.4]] * 2)
+    assert np.array_equal(wrist_angles(one, np.array([1, 1])), [[0.3, 0.4]] * 2)
 
 
 COLUMNS: dict[str, Any] = {

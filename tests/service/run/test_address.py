@@ -17,7 +17,7 @@ from graspd.service.model.errors import InputError, UnavailableError
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import identify
 from graspd.service.queue.rq_queue import RqQueue
-from graspd.service.run.address import bind, forget_address, new_listen_address, record_address, recorded_address
+from graspd.service.run.address import bind_socket, forget_address, new_listen_address, record_address, recorded_address
 from graspd.service.run.children import Child, kill_leftovers, start_time
 from graspd.service.run.doctor.backends import check_index_identity
 from graspd.service.run.doctor.checks import Condition
@@ -89,12 +89,12 @@ def test_a_service_on_any_free_port_is_found_until_it_stops(folder: Path) -> Non
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a second socket of one address is refused there")
 def test_a_port_that_was_found_free_is_kept_for_the_api() -> None:
-    with bind("127.0.0.1", 0) as reserved, socket.socket() as stranger:
+    with bind_socket("127.0.0.1", 0) as reserved, socket.socket() as stranger:
         address = reserved.getsockname()
         with pytest.raises(OSError, match="in use"):
             stranger.bind(address)
         for _ in range(2):  # an API that is started again takes it again
-            with bind(*address) as listener:
+            with bind_socket(*address) as listener:
                 listener.listen()
 
 
@@ -257,7 +257,7 @@ def test_another_number_of_database_is_another_redis(first: Services, redis_serv
     empty_index(settings.resolved_index_url).close()
     second = Services.open(settings)
     second.queue.connection.flushdb()
-    assert identify(second) != first.queue.service()
+    assert identify(second) != first.queue.service_id()
     second.close()
 
 
@@ -272,10 +272,10 @@ def test_store_and_index_lie_in_the_folder_and_nothing_beside_it(name: str, tmp_
     assert [(entry.key, store.get(entry.key)) for entry in store.list("jobs")] == [("jobs/one/job.json", b"{}")]
     assert (settings.data_dir / "store" / "jobs" / "one" / "job.json").exists()
     index = Index(settings.resolved_index_url)
-    index.notes.name_service("one")
+    index.notes.set_service_id("one")
     index.close()
     again = Index(settings.resolved_index_url)
-    assert again.notes.service() == "one"
+    assert again.notes.service_id() == "one"
     again.close()
     assert (settings.data_dir / "index.sqlite").exists()
     assert [path.name for path in tmp_path.iterdir()] == [name]
@@ -287,7 +287,7 @@ def test_a_whole_service_gets_ready_in_an_odd_folder(tmp_path: Path) -> None:
     with Supervisor(settings, workers=0) as supervisor:
         assert supervisor.wait_ready(PATIENCE_S)
         services = Services.open(supervisor.settings)
-        assert services.queue.service() == services.index.notes.service()
+        assert services.queue.service_id() == services.index.notes.service_id()
         services.close()
     assert [path.name for path in tmp_path.iterdir()] == [name]
 

@@ -18,7 +18,7 @@ from pydantic import SecretStr, ValidationError
 from typer.testing import CliRunner
 
 from graspd import cli as program
-from graspd.service.cli import EngineSettings, engine_settings, load_settings, reporting_errors
+from graspd.service.cli import EngineSettings, engine_settings, load_settings, report_errors
 from graspd.service.model.errors import InputError, StoreUnavailable, UnavailableError
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.leading import PART
@@ -50,14 +50,14 @@ def _bad_model() -> ValidationError:
 )
 def test_an_error_is_one_line_and_an_exit_code(error: BaseException, code: int, line: str, capsys: Any) -> None:
     with pytest.raises(typer.Exit) as ended:
-        reporting_errors(Mock(side_effect=error))()
+        report_errors(Mock(side_effect=error))()
     assert ended.value.exit_code == code
     assert capsys.readouterr().err == line
 
 
 def test_a_bug_is_not_dressed_up_as_a_mistake() -> None:
     with pytest.raises(ZeroDivisionError):
-        reporting_errors(lambda: 1 / 0)()
+        report_errors(lambda: 1 / 0)()
 
 
 def test_a_bad_setting_names_its_variable(monkeypatch: pytest.MonkeyPatch) -> None:

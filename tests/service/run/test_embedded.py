@@ -93,7 +93,7 @@ def test_a_log_that_redis_cannot_read_gives_way_to_an_empty_one(
 
     def serve(service: Child) -> int:
         with closing(RqQueue(connect(redis_url(settings), patience=0))) as queue:
-            until(lambda: service.watch() or is_up(queue), "Redis answers")
+            until(lambda: service.restart_if_ended() or is_up(queue), "Redis answers")
             queue.connection.set("kept", "x")
             return int(queue.connection.dbsize())
 

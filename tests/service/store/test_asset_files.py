@@ -18,7 +18,7 @@ from graspd.service.model.states import AssetKind
 from graspd.service.store import network_file
 from graspd.service.store.assets import builtin_files, pack, unpack
 from graspd.service.store.network_file import ProposalNetwork, from_bytes, to_bytes
-from graspd.service.store.object_sets import object_set, read_set
+from graspd.service.store.object_sets import group_objects, read_set
 from tests.networks import random_network
 
 Arrays = dict[str, Any]
@@ -149,13 +149,13 @@ DESCRIBED = ["a/clean.stl", "a/asset.json", "b/clean.stl"]
     ],
 )
 def test_a_folder_of_meshes_is_a_set_of_objects(paths: list[str], objects: dict[str, list[str]]) -> None:
-    assert {name: sorted(files) for name, files in object_set(dict.fromkeys(paths, b"x")).items()} == objects
+    assert {name: sorted(files) for name, files in group_objects(dict.fromkeys(paths, b"x")).items()} == objects
 
 
 def test_a_set_is_a_folder_of_meshes_as_the_reference_objects(shared_data: Path) -> None:
     with pytest.raises(InputError, match="no mesh"):
-        object_set({"a.txt": b""})
-    found = object_set(read_set(shared_data / "objects", limit_bytes=2**26))
+        group_objects({"a.txt": b""})
+    found = group_objects(read_set(shared_data / "objects", limit_bytes=2**26))
     assert len(found) == 14 and list(found["025_mug"]) == ["clean.stl"]
 
 

@@ -28,10 +28,10 @@ from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.contact import LINK_CONTACT_M, finger_of_body
 from graspd.worker.quality.posed import posture_data_of
 from graspd.worker.quality.probe import NearestPoints, Probe
-from graspd.worker.quality.wrench_space import wrenches
+from graspd.worker.quality.wrench_space import contact_wrenches
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.model import MujocoOptions, build
+from graspd.worker.validation.model import MujocoOptions, build_scene
 from tests.worker.hands.urdfs import gripper
 from tests.worker.models import object_from_mesh, on_one_dof, piece, two_finger_hand
 from tests.worker.quality.helpers import choose_contacts, placed_data, plate_hand, posture
@@ -56,7 +56,7 @@ def opened_by_numpy(probe: Probe, grasp: Posture) -> Posture:
     hand = probe.hand
     q = hand.reduce(grasp.joint_positions)
     finger = opening.fingers_of_dofs(hand)
-    paths = _openings(hand, q, _leaving(probe, probe.touch(grasp, reach=opening.CLEARANCE_M), finger))
+    paths = _openings(hand, q, _leaving(probe, probe.nearest_points(grasp, reach=opening.CLEARANCE_M), finger))
     clearance = _finger_clearance(probe, grasp.hand_pose, paths)
     stuck = np.flatnonzero((clearance.max(axis=1) < opening.STUCK_M).any(axis=1))
     if len(stuck):
@@ -167,12 +167,12 @@ def _retreat(probe: Probe, hand_pose: Floats, q: Floats) -> Posture:
 
 def balanced_by_numpy(probe: Probe, grasp: Posture, total: float, *, closing: float) -> list[tuple[float, Floats]]:
     """Residual and torques (D,) of the forces that balance in each grasp; least squares by SciPy."""
-    found = probe.touch(grasp, reach=max(postures.PRESSING_M, closing))
-    pressing = probe.facing(found) & (found.distance < postures.PRESSING_M)
+    found = probe.nearest_points(grasp, reach=max(postures.PRESSING_M, closing))
+    pressing = probe.facing_mask(found) & (found.distance < postures.PRESSING_M)
     finger = finger_of_body(probe.hand)[probe.points.body]
     for f in range(finger.max() + 1):
         idle = ~pressing[:, finger == f].any(axis=1)
-        pressing |= probe.facing(found) & (found.distance < closing) & idle[:, None] & (finger == f)
+        pressing |= probe.facing_mask(found) & (found.distance < closing) & idle[:, None] & (finger == f)
     out = []
     for b in range(len(grasp)):
         place, normal = found.closest[b], found.normal[b]
@@ -186,7 +186,7 @@ def _balanced(
     probe: Probe, bodies: Floats, body: NDArray[np.int32], place: Floats, normal: Floats, total: float
 ) -> tuple[float, Floats]:
     hand, obj = probe.hand, probe.obj
-    edge = wrenches(place, normal, friction=postures.FRICTION, centre=obj.centre_of_mass, radius=obj.radius)
+    edge = contact_wrenches(place, normal, friction=postures.FRICTION, centre=obj.centre_of_mass, radius=obj.radius)
     torque = generalized_forces(hand, bodies, body, place, edge[..., :3]).reshape(-1, hand.dofs)
     edge = edge.reshape(-1, 6)
     effort = torque / hand.effort
@@ -387,7 +387,7 @@ def test_hands_open_and_press_as_in_numpy(case: tuple[HandModel, Probe, Posture]
     np.testing.assert_allclose(held.torque, torque, atol=1e-7)
     np.testing.assert_allclose(pressed, closing, atol=1e-7)
     assert 0 < np.count_nonzero(held.residual < 1.0) < len(grasp) and np.abs(torque - closing).max() > 1e-3
-    near = probe.touch(grasp, reach=LINK_CONTACT_M).distance < LINK_CONTACT_M
+    near = probe.nearest_points(grasp, reach=LINK_CONTACT_M).distance < LINK_CONTACT_M
     links = [len(np.unique(probe.points.body[one])) for one in near]
     assert postures.touching_links(hand, OBJ, grasp).tolist() == links and len(set(links)) > 2
 
@@ -398,7 +398,7 @@ def grasp_of(hand: HandModel) -> Posture:
 
 def pad_forces(hand: HandModel, obj: ObjectModel, grasp: Posture) -> list[float]:
     """Normal force at each pad [N] after the hand has pressed for three seconds."""
-    scene = build(hand, obj, decompose(obj), MujocoOptions())
+    scene = build_scene(hand, obj, decompose(obj), MujocoOptions())
     data = placed_data(scene, grasp.joint_positions[0], grasp.hand_pose[0])
     pressed = squeeze(hand, obj, grasp)
     scene.command(data, pressed.hand_pose[0], pressed.joint_positions[0])

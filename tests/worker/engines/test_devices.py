@@ -233,7 +233,7 @@ def test_a_cache_keeps_what_it_has(kernels: Path, tmp_path: Path, monkeypatch: p
     kept.parent.mkdir()
     kept.write_bytes(b"ours")
     monkeypatch.setenv(backend.VARIABLE, str(kernels))
-    backend.copy_compiled(tmp_path)
+    backend.copy_compiled_kernels(tmp_path)
     assert len(files(tmp_path)) == len(files(kernels))
     assert kept.read_bytes() == b"ours"
 

@@ -94,7 +94,7 @@ def test_no_kind_is_more_frequent_than_the_median_one(folder: Path, tmp_path: Pa
     out = tmp_path / "even"
     assert run("balance", folder, "--by", "type", "-o", out).exit_code == 0
     for obj, each in (("mug", 2 * COUNT), ("drill", COUNT)):
-        types = Grasps(open_shards(out).only(objects=[obj])).arrays("quality/grasp_type")["quality/grasp_type"]
+        types = Grasps(open_shards(out).select(objects=[obj])).arrays("quality/grasp_type")["quality/grasp_type"]
         power, precision = int((types == 1).sum()), int((types == 2).sum())
         # Kinds have 3/4 and 1/4 of each: the median of the two is half.
         assert (power, precision) == (each // 2, each // 4)

@@ -9,9 +9,9 @@ import pytest
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats, quat_from_axis_angle, quat_multiply, quat_rotate
 from graspd.service.store.asset_summary import summary
-from graspd.service.store.descriptions import HandCorrections, apply_corrections, facts_of
+from graspd.service.store.descriptions import HandCorrections, apply_corrections, read_hand_facts
 from graspd.worker.hands.check import check_hand
-from graspd.worker.hands.jaws import fingertip_pad, pads_of, sign_of
+from graspd.worker.hands.jaws import dominant_sign, fingertip_pad, pads_of
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.stages.models import hand_glb
@@ -181,7 +181,11 @@ def test_rounding_turns_neither_palm_nor_jaws_nor_closing() -> None:
         np.testing.assert_allclose(load(claw(3, TURNS["upright"], noise=noise)).palm.approach, [0, 0, 1], atol=1e-9)
     for noise in (1e-17, -1e-17):
         line = np.array([noise, 1.0, -noise])
-        assert sign_of(line) == 1 and sign_of(-line) == -1 and sign_of(np.array([1.0, -1.0 - noise, 0])) == 1
+        assert (
+            dominant_sign(line) == 1
+            and dominant_sign(-line) == -1
+            and dominant_sign(np.array([1.0, -1.0 - noise, 0])) == 1
+        )
     for lower in ("-0.7", "-0.7000001", "-0.6999999"):
         assert (load(claw(3, TURNS["upright"]).replace(b'"-0.4"', f'"{lower}"'.encode())).closing == 1).all()
 
@@ -229,7 +233,7 @@ def same(one: HandModel, other: HandModel, *, palm: bool) -> bool:
 )
 def test_corrections_and_options_make_the_same_hand(said, options, palm: bool, tmp_path) -> None:
     (tmp_path / "claw.urdf").write_bytes(CLAW_URDF)
-    facts = facts_of(hand_glb(hand_from_path(tmp_path / "claw.urdf")))
+    facts = read_hand_facts(hand_glb(hand_from_path(tmp_path / "claw.urdf")))
     there = apply_corrections({"file": "claw.urdf"}, facts, HandCorrections.model_validate(said))
     named = load_hand({"claw.urdf": CLAW_URDF, "asset.json": json.dumps(there).encode()}, name="claw", digest="")
     written = tmp_path / "asset.json"
@@ -243,7 +247,7 @@ def test_corrections_and_options_make_the_same_hand(said, options, palm: bool, t
 def test_a_corrected_approach_is_a_direction_and_no_more() -> None:
     hand = load_hand({"claw.urdf": CLAW_URDF}, name="claw", digest="")
     said = HandCorrections.model_validate({"palm": {"link": "palm", "approach": [0, 2, 0]}})
-    there = apply_corrections({"file": "claw.urdf", "approach": [1, 0, 0]}, facts_of(hand_glb(hand)), said)
+    there = apply_corrections({"file": "claw.urdf", "approach": [1, 0, 0]}, read_hand_facts(hand_glb(hand)), said)
     made = load_hand({"claw.urdf": CLAW_URDF, "asset.json": json.dumps(there).encode()}, name="claw", digest="")
     assert made.palm.approach.tolist() == [0, 1, 0] and same(made, hand, palm=False)
     assert np.allclose(made.palm.centre, hand.palm.centre, atol=2e-6)
@@ -251,7 +255,7 @@ def test_a_corrected_approach_is_a_direction_and_no_more() -> None:
 
 def test_the_model_tells_every_link_and_pads_are_where_jaws_meet() -> None:
     hand = load_hand({"claw.urdf": CLAW_URDF}, name="claw", digest="")
-    facts = facts_of(hand_glb(hand))
+    facts = read_hand_facts(hand_glb(hand))
     assert set(facts.links) == {"palm", "a", "b", "c", "mount", "tip"} and facts.bodies == ["palm", "a", "b", "c"]
     body, pose = hand.frames["tip"]
     assert hand.body_names[body] == "a" and np.allclose(pose[:3], [0, 0, 0.04])

@@ -15,7 +15,7 @@ from graspd.client.add_commands import upload_of
 from graspd.commands.hands import report_hand
 from graspd.service.model.errors import HandError, InputError
 from graspd.service.model.states import AssetKind
-from graspd.service.store.hand_files import main_of
+from graspd.service.store.hand_files import find_main_file
 from graspd.service.store.library import publish_asset
 from graspd.service.store.store import open_store
 from graspd.worker.hands.check import check_hand
@@ -421,7 +421,7 @@ def test_of_several_descriptions_one_is_named(tmp_path: Path) -> None:
         files = files_of_upload(AssetKind.HAND, "h.zip", packed, limit_bytes=1 << 20, options=options)
         assert b'"urdf/right.urdf"' in files["asset.json"]
     with pytest.raises(InputError, match=r"2 files called 'h\.urdf'.*name one by its path"):
-        main_of(dict.fromkeys(("old/h.urdf", "new/h.urdf"), b"<robot/>"), "h.urdf")
+        find_main_file(dict.fromkeys(("old/h.urdf", "new/h.urdf"), b"<robot/>"), "h.urdf")
 
 
 def test_a_folder_of_too_many_files_is_no_hand(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:

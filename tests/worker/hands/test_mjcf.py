@@ -16,7 +16,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.tendons import Tendon, actuator_matrix
-from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_of
+from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_digest
 from tests.worker.hands.mjcfs import CLAW, FOUR_BAR, TENDON_CLAW
 
 #: Both sides compute in float64; what is left is rounding over a chain of a dozen rotations [m, and entries of R].
@@ -247,8 +247,8 @@ def test_what_a_hand_does_not_have_does_not_change_its_content() -> None:
         tendons: tuple[str, ...] = field(default=(), metadata=TOLD_IF_SET)
 
     # What is known of a hand is kept under it.
-    assert content_of(Hand()) == content_of(make_dataclass("Hand", [])())
-    assert content_of(Hand(("t",))) != content_of(Hand())
+    assert content_digest(Hand()) == content_digest(make_dataclass("Hand", [])())
+    assert content_digest(Hand(("t",))) != content_digest(Hand())
     assert {f.name for f in fields(HandModel) if "told_if_set" in f.metadata} == {"tendons", "drag", "mounting"}
 
 

@@ -30,11 +30,11 @@ from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.pinch_postures import oppositions_of
+from graspd.worker.hands.pinch_postures import pinch_postures_of
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.simulation.device import joint_units
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.model import MujocoOptions, build
+from graspd.worker.validation.model import MujocoOptions, build_scene
 from tests.worker.hands.urdfs import BOX, OPENING, gripper, joint, limits, link, robot
 from tests.worker.models import object_from_mesh, two_finger_hand
 
@@ -104,7 +104,7 @@ PLANE_M = 1e-9
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
 def test_fingertips_lie_on_both_sides_of_the_middle(name: str) -> None:
     hand = hand_from_path(name)
-    found = oppositions_of(hand)
+    found = pinch_postures_of(hand)
     assert len(found) >= 20 and (np.diff(found.width) >= 0).all()
     assert ((found.q >= hand.lower) & (found.q <= hand.upper)).all()
     root = np.tile([0.0, 0, 0, 1, 0, 0, 0], (len(found), 1))
@@ -118,10 +118,10 @@ def test_fingertips_lie_on_both_sides_of_the_middle(name: str) -> None:
 
 
 def test_a_wide_hand_opposes_over_a_range_one_finger_nothing() -> None:
-    widths = oppositions_of(hand_from_path("barrett")).width
+    widths = pinch_postures_of(hand_from_path("barrett")).width
     assert widths[0] < 0.08 < 0.12 < widths[-1]
     hand = hand_from_path("barrett")
-    alone = oppositions_of(replace(hand, name="alone", fingertips=hand.fingertips[:1]))
+    alone = pinch_postures_of(replace(hand, name="alone", fingertips=hand.fingertips[:1]))
     assert len(alone) == 0 and alone.widest == 0.0
 
 
@@ -174,7 +174,7 @@ def test_hand_looks_at_thing_from_both_sides_and_leaves_it_room(size: Size) -> N
 
 def test_spans_begin_where_pads_end() -> None:
     hand = hand_from_path("allegro")
-    pads = oppositions_of(hand).width
+    pads = pinch_postures_of(hand).width
     assert postures_for_size(hand, "small").width[0] < pads[0] - 0.005
     assert postures_for_size(hand, "wide").width[-1] > pads[-1] + 0.005
 
@@ -231,9 +231,9 @@ def test_the_opening_is_the_distance_of_the_pads_in_mujoco(zero_is_open: bool) -
 def _apart(hand: HandModel, q: np.ndarray) -> float:
     """Distance of the two fingers' geoms in MuJoCo [m]."""
     obj = object_from_mesh(trimesh.creation.box((0.02, 0.02, 0.02)))
-    scene = build(hand, obj, decompose(obj), MujocoOptions())
+    scene = build_scene(hand, obj, decompose(obj), MujocoOptions())
     data = mujoco.MjData(scene.model)
-    scene.place(data, np.array([0, 0, 1.0, 1, 0, 0, 0]), hand.expand(q))
+    scene.set_posture(data, np.array([0, 0, 1.0, 1, 0, 0, 0]), hand.expand(q))
     mujoco.mj_forward(scene.model, data)
     first, second = (int(np.flatnonzero(scene.model.geom_bodyid == scene.model.body(f"body{b}").id)[0]) for b in (1, 2))
     return float(mujoco.mj_geomDistance(scene.model, data, first, second, 1.0, None))

@@ -10,8 +10,8 @@ import trimesh
 from PIL import Image
 
 from graspd.service.model.errors import LimitError, MeshError
-from graspd.service.store.hand_files import files_of_hand
-from graspd.service.store.mesh_files import MAX_NAMES, appearance_files, resolve
+from graspd.service.store.hand_files import find_hand_files
+from graspd.service.store.mesh_files import MAX_NAMES, appearance_files, resolve_appearance_file
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.formats import read_mesh
@@ -225,7 +225,7 @@ def test_a_change_of_a_picture_is_another_look() -> None:
 @pytest.mark.parametrize("reference", OUTSIDE)
 def test_names_lead_nowhere_else(reference: str) -> None:
     there = {"secret.png", "/etc/secret.png", "../secret.png", "m/secret.stl", "etc/secret.png"}
-    assert resolve("m/part.obj", reference, there.__contains__) is None
+    assert resolve_appearance_file("m/part.obj", reference, there.__contains__) is None
 
 
 def test_a_hand_brings_looks_its_meshes_name_none_from_outside(tmp_path) -> None:
@@ -240,7 +240,7 @@ def test_a_hand_brings_looks_its_meshes_name_none_from_outside(tmp_path) -> None
     (tmp_path / "secret.png").write_bytes(picture())
     (folder / "h.urdf").write_bytes(urdf_seen_as("m/part.obj"))
     for given in (folder / "h.urdf", folder):
-        files, _ = files_of_hand(given)
+        files, _ = find_hand_files(given)
         assert set(files) == {"h.urdf", "m/part.obj", "m/looks/part.mtl", "m/other.mtl", "m/looks/skin.png"}
     hand = hand_from_path(folder / "h.urdf")
     assert {mesh.colour for mesh in hand.visuals.meshes} == {None, GREEN, RED}

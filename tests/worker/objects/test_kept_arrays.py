@@ -27,17 +27,17 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects import disk_cache, prepare
-from graspd.worker.objects.disk_cache import cached_arrays, cached_step, caching_steps, content_of
+from graspd.worker.objects.disk_cache import cached_arrays, cached_step, caching_steps, content_digest
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object, object_from_path
 from graspd.worker.quality.probe import probe_of
-from graspd.worker.rendering.scene_setup import CameraPlan, Setting
+from graspd.worker.rendering.scene_setup import CameraPlan, SceneSetup
 from graspd.worker.scenes.simulate import rest_probability
 from graspd.worker.simulation import sampling
 from graspd.worker.stages import assets
 from graspd.worker.stages.assets import prepared_object
 from graspd.worker.stages.context import batch_seed
-from graspd.worker.stages.models import hand_glb, model_of, object_glb, publish_model
+from graspd.worker.stages.models import hand_glb, model_glb, object_glb, publish_model
 from tests.fakes import message_for, request
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.objects.shapes import box, join, sphere, stl
@@ -79,7 +79,7 @@ def test_samples_are_those_of_a_process_without_a_cache(own_cache: Path) -> None
     for _ in range(2):
         found, fresh = surface._cached_samples.__wrapped__(shapes, 120, 2), surface._sample(shapes, 120, 2)
         assert all(np.array_equal(getattr(found, name), array) for name, array in vars(fresh).items())
-        assert np.array_equal(sampling.object_samples(ball, 90, seed=1), sampling._sampled(ball, 90, 1))
+        assert np.array_equal(sampling.object_samples(ball, 90, seed=1), sampling._sample_surface(ball, 90, 1))
 
 
 def test_small_steps_are_kept_together_each_by_what_it_is_given(own_cache: Path) -> None:
@@ -111,8 +111,8 @@ def test_a_hand_is_the_same_from_kept_shapes_and_needs_no_scipy(tmp_path: Path) 
 
 
 def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options) -> ObjectModel:
-    prepare._prepared.cache_clear()
-    prepare._repaired.cache_clear()
+    prepare._prepare.cache_clear()
+    prepare._repair_file.cache_clear()
     return load_object(files, name="balls", digest="d", face_error_m=error, options=options)
 
 
@@ -152,7 +152,7 @@ def test_whatever_it_follows_from_makes_another_entry(built: list[float], monkey
 
 
 def test_the_revision_follows_the_code_and_the_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(disk_cache, "revision", disk_cache.revision.__wrapped__)
+    monkeypatch.setattr(disk_cache, "code_revision", disk_cache.code_revision.__wrapped__)
     plain = prepare.revision.__wrapped__()
     monkeypatch.setattr(disk_cache, "version_of", lambda name: f"0 of {name}")
     libraries = prepare.revision.__wrapped__()
@@ -180,7 +180,7 @@ def test_whatever_differs_in_a_model_changes_its_content(model) -> None:
         assert (changed.content == model.content) == (field.name in ("name", "digest", "parts")), field.name
     assert dataclasses.replace(BRICK, vertices=BRICK.vertices.ravel()).content != BRICK.content
     with pytest.raises(TypeError, match="object"):
-        content_of(dataclasses.replace(BRICK, repairs=object()))  # type: ignore[arg-type]
+        content_digest(dataclasses.replace(BRICK, repairs=object()))  # type: ignore[arg-type]
 
 
 def test_no_cache_gives_one_mesh_of_a_file_for_another(own_cache: Path) -> None:
@@ -189,7 +189,7 @@ def test_no_cache_gives_one_mesh_of_a_file_for_another(own_cache: Path) -> None:
     one, two = (probe_of(HAND, obj, hand_points=64, object_points=64) for obj in (BRICK, other))
     assert not np.array_equal(one.samples, two.samples)
     plan, pose = CameraPlan(1, 16, 16, None), np.array([[[0.0, 0, 0, 1, 0, 0, 0]]])
-    first, second = (Setting([obj], pose, plan, seed=0, samples=1) for obj in (BRICK, other))
+    first, second = (SceneSetup([obj], pose, plan, seed=0, samples=1) for obj in (BRICK, other))
     assert first._key() != second._key()
     # The fingers stand elsewhere on the same palm: the same pieces bury other points.
     origin = HAND.origin.copy()
@@ -251,7 +251,7 @@ def test_a_hands_nodes_stand_where_kinematics_puts_its_bodies(name: str) -> None
 @pytest.mark.parametrize("kind", list(AssetKind))
 def test_models_that_come_with_graspd_are_those_of_its_assets(kind: AssetKind) -> None:
     for name in builtin_names(kind):
-        made = model_of(kind, name, builtin_files(kind, name))
+        made = model_glb(kind, name, builtin_files(kind, name))
         assert made == builtin_model(kind, name), "python -m graspd.worker.stages.models"
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from graspd.commands.objects import report_object
 from graspd.worker.objects.check import check_object
-from graspd.worker.objects.intersections import intersecting_faces, untangle
+from graspd.worker.objects.intersections import intersecting_faces, unite_self_overlaps
 from graspd.worker.objects.mesh_geometry import from_manifold, signed_volume
 from graspd.worker.objects.prepare import load_object
 from graspd.worker.objects.topology import is_closed
@@ -176,9 +176,9 @@ def test_what_a_tube_encloses_twice_counts_once() -> None:
     twist: NDArray[np.float64] = vertices.copy()  # a box of whose corners two changed places: in part it is everted
     twist[:, :2] *= -np.sign(vertices[:, 2:]) * (np.abs(vertices[:, 2:]) > 0.01) + (np.abs(vertices[:, 2:]) <= 0.01)
     twist[vertices[:, 2] > 0, 2] *= -0.5
-    assert untangle(twist, faces) is None, "what cannot be repaired safely is left"
+    assert unite_self_overlaps(twist, faces) is None, "what cannot be repaired safely is left"
     tube = crossing_tube()
-    united = untangle(*tube)
+    united = unite_self_overlaps(*tube)
     assert signed_volume(*tube) - signed_volume(*united) == pytest.approx(SHARED, rel=ROUGHLY)
     left = intersecting_faces(*united)
     assert left is not None and not len(left)

@@ -17,10 +17,10 @@ from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.synthesis import synthesize_grasps
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.flat_pinches import flat_pinches
-from graspd.worker.hands.jaws import fingertip_pad, pads_of, thinnest_fingertip
+from graspd.worker.hands.jaws import fingertip_pad, least_fingertip_width, pads_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.pinch_postures import oppositions_of
+from graspd.worker.hands.pinch_postures import pinch_postures_of
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PlanRequest, fitting_pairs, synthesize
 from graspd.worker.planners.fast_graspd import antipodal_starts, starts
@@ -212,7 +212,7 @@ def test_pairs_of_a_ball_are_its_chords_within_the_cones() -> None:
 
 
 def test_what_a_hand_cannot_span_or_reach_is_told(barrett) -> None:
-    known = oppositions_of(barrett)
+    known = pinch_postures_of(barrett)
     assert Openings.of(known, BLOCK, lying(BLOCK)).within_reach
     deep = Environment((Obstacle.half_space(UP, float(BLOCK.vertices[:, 2].max()) + 0.01),), UP)
     assert not Openings.of(known, BLOCK, deep).within_reach
@@ -226,7 +226,7 @@ def test_hands_reach_across_what_lies_flat_from_above(barrett) -> None:
     scene, standing = lying(flat), Environment((Obstacle.half_space([1.0, 0, 0], -0.03),), np.array([1.0, 0, 0]))
     opening = Openings.in_scene(barrett, flat, scene)
     assert len(opening.known) == len(flat_pinches(barrett, 0.01)) > 0
-    assert len(Openings.in_scene(barrett, flat, standing).known) == len(oppositions_of(barrett))
+    assert len(Openings.in_scene(barrett, flat, standing).known) == len(pinch_postures_of(barrett))
     found = place_antipodal_hands(
         barrett, flat, opening, np.random.default_rng(1).random((60, 6)), free_directions(scene, flat)
     )
@@ -236,7 +236,7 @@ def test_hands_reach_across_what_lies_flat_from_above(barrett) -> None:
 
 def test_hands_hold_the_middle_and_come_from_a_free_way(barrett) -> None:
     rng = np.random.default_rng(0)
-    opening, known = Openings.of(oppositions_of(barrett), BLOCK, lying(BLOCK)), oppositions_of(barrett)
+    opening, known = Openings.of(pinch_postures_of(barrett), BLOCK, lying(BLOCK)), pinch_postures_of(barrett)
     uniform = rng.random((40, 6))
     uniform[:, 5] = 0.0
     found = place_antipodal_hands(barrett, BLOCK, opening, uniform, np.array([[0.0, 0, 1]]))
@@ -275,7 +275,7 @@ def test_a_hand_around_an_edge_or_below_a_board_is_hindered(barrett) -> None:
 
 
 def test_how_far_pair_is_beside_pads_of_a_hand_that_was_moved(barrett) -> None:
-    opening = Openings.of(oppositions_of(barrett), BLOCK, lying(BLOCK))
+    opening = Openings.of(pinch_postures_of(barrett), BLOCK, lying(BLOCK))
     uniform, ways = np.random.default_rng(0).random((30, 6)), np.array([[0.0, 0, 1]])
     found = place_antipodal_hands(barrett, BLOCK, opening, uniform, ways)
     assert found.deep.min() >= 0.0 and found.deep.max() > 0.02
@@ -292,13 +292,13 @@ def test_how_far_pair_is_beside_pads_of_a_hand_that_was_moved(barrett) -> None:
 
 @pytest.mark.parametrize("tips_m", [None, 0.0])
 def test_outlines_tell_how_far_a_hand_must_rise(barrett, tips_m) -> None:
-    opening = Openings.of(oppositions_of(barrett), BLOCK, lying(BLOCK))
+    opening = Openings.of(pinch_postures_of(barrett), BLOCK, lying(BLOCK))
     uniform, ways = np.random.default_rng(0).random((60, 6)), np.array([[0.0, 0, 1], [0.6, 0, 0.8]])
     table = replace(lying(BLOCK).obstacles[0], tips_m=tips_m)
     scene = Environment((table,), UP)
     found = place_antipodal_hands(barrett, BLOCK, opening, uniform, ways)
     centre = found.pivot + BLOCK.centre_of_mass
-    known = oppositions_of(barrett).q
+    known = pinch_postures_of(barrett).q
     outlines, again, few = (antipodal_starts.posture_outlines(barrett, q) for q in (known, known.copy(), known[:3]))
     assert outlines is again and len(few.points) == 3
     told = outlines.missing_clearance(found.posture, found.turn, centre, scene, room=0.006)
@@ -317,7 +317,7 @@ def test_outlines_tell_how_far_a_hand_must_rise(barrett, tips_m) -> None:
 
 def test_draws_that_need_not_rise_come_first_in_their_order(barrett) -> None:
     scene = lying(BLOCK)
-    opening = Openings.of(oppositions_of(barrett), BLOCK, scene)
+    opening = Openings.of(pinch_postures_of(barrett), BLOCK, scene)
     uniform, ways = np.random.default_rng(1).random((5, 40, 6)), free_directions(scene, BLOCK)
     order, off = select_draws(barrett, BLOCK, opening, uniform, ways, scene, room=0.006, keep=40)
     assert np.array_equal(np.sort(order, axis=1), np.tile(np.arange(40), (5, 1)))
@@ -364,7 +364,7 @@ def beside_walls(gap: float, axes: tuple[int, ...]) -> Environment:
 
 def test_a_gap_is_named_with_the_fingertip_that_does_not_fit(barrett) -> None:
     told = narrow_reason(barrett, BOX, [beside_walls(0.008, (0, 1))])
-    assert "about 8 mm" in told and f"{1e3 * thinnest_fingertip(barrett):.0f} mm" in told
+    assert "about 8 mm" in told and f"{1e3 * least_fingertip_width(barrett):.0f} mm" in told
     # One of several scenes that has room is enough, and so is one axis that is free.
     assert narrow_reason(barrett, BOX, [beside_walls(0.008, (0, 1)), beside_walls(0.03, (0, 1))]) is None
     assert narrow_reason(barrett, BOX, [beside_walls(0.008, (0,))]) is None
@@ -374,7 +374,7 @@ def test_a_gap_is_named_with_the_fingertip_that_does_not_fit(barrett) -> None:
 def test_what_is_too_wide_is_told(barrett) -> None:
     large = object_from_mesh(trimesh.creation.box([0.4, 0.4, 0.4]))
     table = Environment((Obstacle.half_space(UP, -0.2),), UP)
-    assert f"opens to {1e3 * oppositions_of(barrett).widest:.0f} mm" in str(narrow_reason(barrett, large, [table]))
+    assert f"opens to {1e3 * pinch_postures_of(barrett).widest:.0f} mm" in str(narrow_reason(barrett, large, [table]))
 
 
 def test_a_ball_beside_a_pair_keeps_its_distance_from_a_wall() -> None:
@@ -388,14 +388,14 @@ def test_a_ball_beside_a_pair_keeps_its_distance_from_a_wall() -> None:
 
 
 def test_pairs_with_room_for_fingertips_are_drawn_more_often(barrett) -> None:
-    scene, known = beside_walls(0.008, (0,)), oppositions_of(barrett)
+    scene, known = beside_walls(0.008, (0,)), pinch_postures_of(barrett)
 
     def share(tip: float) -> float:
         opening = Openings.of(known, BOX, scene, tip=tip)
         chance = np.diff(opening.sums, prepend=0.0)
         return float(chance[np.abs(opening.pairs.axis[:, 1]) > 0.9].sum())
 
-    assert share(thinnest_fingertip(barrett)) > 0.85 > share(0.0)
+    assert share(least_fingertip_width(barrett)) > 0.85 > share(0.0)
 
 
 def test_candidate_grasps_none_of_which_is_valid_come_with_the_reason(tmp_path) -> None:

@@ -56,7 +56,7 @@ class Worker:
         return int(child)
 
     def events(self) -> list[EventKind]:
-        return [event.kind for _, event in self.queue.tail("0", limit=100, wait_s=0)]
+        return [event.kind for _, event in self.queue.events_after("0", limit=100, wait_s=0)]
 
     def states(self) -> list[str]:
         return [beat.state for beat in self.queue.workers()]
@@ -262,7 +262,7 @@ def test_what_a_worker_is_at_is_shown_at_once(heart: Heartbeat, rq_queue: RqQueu
 def test_a_worker_that_leaves_is_not_lost(heart: Heartbeat, rq_queue: RqQueue) -> None:
     heart.stop()
     assert rq_queue.workers() == []
-    assert [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)] == [EventKind.LEFT]
+    assert [event.kind for _, event in rq_queue.events_after("0", limit=10, wait_s=0)] == [EventKind.LEFT]
 
 
 def test_it_goes_on_when_redis_answers_again(heart: Heartbeat, rq_queue: RqQueue) -> None:
@@ -286,7 +286,7 @@ def work(rq_queue, redis_server: str, tmp_path):
 
 @pytest.fixture
 def kinds(rq_queue):
-    return lambda: [event.kind for _, event in rq_queue.tail("0", limit=100, wait_s=0)]
+    return lambda: [event.kind for _, event in rq_queue.events_after("0", limit=100, wait_s=0)]
 
 
 def _waits(redis: Any, entry: str | bytes) -> None:
@@ -360,7 +360,7 @@ def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue, work, kinds)
         rq_queue.connection.config_set("min-replicas-to-write", replicas)
 
     def stage(message: TaskMessage, context: TaskContext):
-        until(lambda: rq_queue.tail("0", limit=1, wait_s=0), "it was told that the task began")
+        until(lambda: rq_queue.events_after("0", limit=1, wait_s=0), "it was told that the task began")
         refuse(1)
         threading.Timer(1.0, refuse, [0]).start()
         return fake_synthesize(message, context)

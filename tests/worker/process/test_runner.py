@@ -229,7 +229,7 @@ def test_progress_of_a_part_is_told_as_its_share_and_only_now_and_then(monkeypat
     told: list[tuple[float, float, str]] = []
     context = TaskContext(open_store("memory://"), tell=lambda *args: told.append(args))
     for step in range(1, 10_000):
-        context.run.part(0.8, 1.0).progress(step, 2, "quality")
+        context.run.with_progress_range(0.8, 1.0).progress(step, 2, "quality")
     assert told == [(pytest.approx(0.9), 1.0, "quality")]
 
 

@@ -67,7 +67,7 @@ def pad_hand() -> HandModel:
 def placed_data(scene: Scene, joints: np.ndarray, pose: np.ndarray = FAR) -> mujoco.MjData:
     """Data of a scene whose hand is at a pose with these joints."""
     data = mujoco.MjData(scene.model)
-    scene.place(data, pose, joints)
+    scene.set_posture(data, pose, joints)
     mujoco.mj_forward(scene.model, data)
     return data
 

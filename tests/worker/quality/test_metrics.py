@@ -26,10 +26,10 @@ from graspd.worker.objects import disk_cache
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality import diversity, probe
 from graspd.worker.quality.contact import contact_distance_consistency_mm, finger_of_body, spread_contacts
-from graspd.worker.quality.diversity import cells_of, distances, distinct_mask, hand_points, least_distance
+from graspd.worker.quality.diversity import direction_cells, distinct_mask, grasp_distances, hand_points, least_distance
 from graspd.worker.quality.gate import MAX_PENETRATION_MM, MAX_SELF_PENETRATION_MM, MIN_CONTACT_LINKS, passes_gate
 from graspd.worker.quality.grasp_type import RULES, ContactPattern
-from graspd.worker.quality.intervals import wilson, wilson_of_mean
+from graspd.worker.quality.intervals import wilson_interval, wilson_interval_of_mean
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from graspd.worker.quality.table import measure
 from graspd.worker.quality.volume import VOXEL_M, Overlap, SharedVolume
@@ -87,8 +87,8 @@ def test_voxels_agree_with_the_exact_volume() -> None:
     assert SharedVolume(hand, BOX).voxel_volume(bodies, np.array([1, 2])) == pytest.approx(7.2, abs=bound)
     # Pieces that overlap are counted once.
     twice = dataclasses.replace(hand, pieces=(*hand.pieces, hand.pieces[1]))
-    once = SharedVolume(hand, BOX).of(bodies[None], np.ones((1, 3), bool))
-    assert SharedVolume(twice, BOX).of(bodies[None], np.ones((1, 4), bool)) == pytest.approx(once, rel=SINGLE)
+    once = SharedVolume(hand, BOX).volumes(bodies[None], np.ones((1, 3), bool))
+    assert SharedVolume(twice, BOX).volumes(bodies[None], np.ones((1, 4), bool)) == pytest.approx(once, rel=SINGLE)
 
 
 def test_thin_wall_between_hand_points_is_noticed() -> None:
@@ -233,20 +233,20 @@ def test_each_bound_is_inclusive_and_decides_alone(name: str, bound: float, wors
 
 def test_bars_of_shares_and_means_cover_the_truth() -> None:
     counts = np.random.default_rng(2).binomial(20, 0.2, size=4000)
-    bounds = np.array([wilson(k, 20) for k in range(21)])[counts]
+    bounds = np.array([wilson_interval(k, 20) for k in range(21)])[counts]
     assert np.mean((bounds[:, 0] <= 0.2) & (bounds[:, 1] >= 0.2)) == pytest.approx(0.95, abs=0.025)
-    assert wilson(0, 16)[1] > 0.1 and wilson(16, 16)[0] < 0.9
+    assert wilson_interval(0, 16)[1] > 0.1 and wilson_interval(16, 16)[0] < 0.9
     for part, whole in ((0, 5), (3, 8), (8, 8), (41, 120)):
-        assert wilson_of_mean(float(part), whole) == pytest.approx(wilson(part, whole), abs=1e-12)
-    assert wilson(2, 8)[0] < wilson_of_mean(2.5, 8)[0] < wilson(3, 8)[0]
+        assert wilson_interval_of_mean(float(part), whole) == pytest.approx(wilson_interval(part, whole), abs=1e-12)
+    assert wilson_interval(2, 8)[0] < wilson_interval_of_mean(2.5, 8)[0] < wilson_interval(3, 8)[0]
 
 
 def kept_and_shared(obj: ObjectModel, postures: Posture) -> tuple[np.ndarray, np.ndarray]:
     """(B, P) what the test keeps, and the volume that each piece shares with the object by the boolean [cm^3]."""
     probe, volume = Probe(HAND, obj, hand_points=300, object_points=500), SharedVolume(HAND, obj)
     found, overlap = probe.measure(postures), Overlap(HAND, probe)
-    kept = overlap.of(found, np.repeat(EVERY, len(found.bodies), axis=0))
-    alone = [volume.of(found.bodies, np.arange(len(HAND.pieces)) == np.full((len(kept), 1), p)) for p in range(3)]
+    kept = overlap.overlapping_pieces(found, np.repeat(EVERY, len(found.bodies), axis=0))
+    alone = [volume.volumes(found.bodies, np.arange(len(HAND.pieces)) == np.full((len(kept), 1), p)) for p in range(3)]
     return kept, np.stack(alone, axis=1)
 
 
@@ -292,7 +292,7 @@ def test_later_process_measures_with_what_the_first_one_computed(own_cache, monk
         patched.setattr(Probe, "_query", never)
         again = Probe(FINGERS, BALL, hand_points=200, object_points=64)
     assert same(distances_of(again), first)
-    monkeypatch.setattr(probe, "binary_name", lambda module: "that of another processor")
+    monkeypatch.setattr(probe, "binary_identity", lambda module: "that of another processor")
     Probe(FINGERS, BALL, hand_points=100, object_points=64)
     assert len(list(own_cache.rglob("coarse_grids/*"))) == 2
 
@@ -317,11 +317,11 @@ def moved(hand: HandModel, by: float) -> np.ndarray:
 
 def test_shifted_hand_is_off_by_the_shift_a_joint_by_its_points() -> None:
     # To rounding: every point moves by the same.
-    assert distances(moved(pad_hand(), 0.003), FIRST, SECOND) == pytest.approx([0.003], abs=1e-12)
+    assert grasp_distances(moved(pad_hand(), 0.003), FIRST, SECOND) == pytest.approx([0.003], abs=1e-12)
     points = hand_points(plate_hand(), posture(((0, 0, 0), (0.02, 0.02)), ((0, 0, 0), (0.03, 0.02))))
     slid = np.linalg.norm(points[0] - points[1], axis=1) > 1e-9
     assert 0 < slid.sum() < diversity.POINTS
-    assert distances(points, FIRST, SECOND) == pytest.approx([0.010 * slid.mean()], abs=1e-12)
+    assert grasp_distances(points, FIRST, SECOND) == pytest.approx([0.010 * slid.mean()], abs=1e-12)
 
 
 def test_of_grasps_that_are_near_the_first_is_kept() -> None:
@@ -343,7 +343,7 @@ def test_distinct_grasps_keep_the_given_nearest_sees_all_pairs() -> None:
     # Turned about their middles too, so that near middles are no near grasps.
     points = rng.normal(0, 0.05, (60, 1, 3)) + rng.normal(0, 0.03, (60, 8, 3))
     rows, others = np.triu_indices(len(points), 1)
-    assert least_distance(points) == pytest.approx(distances(points, rows, others).min(), rel=1e-12)
+    assert least_distance(points) == pytest.approx(grasp_distances(points, rows, others).min(), rel=1e-12)
     assert least_distance(points[:1]) is None and least_distance(np.zeros((3, 8, 3))) == 0
 
 
@@ -359,7 +359,7 @@ def test_cell_of_approach_is_that_of_where_the_palm_comes_from() -> None:
     upright, upside_down = [1.0, 0, 0, 0], [0.0, 1, 0, 0]
     low, high = diversity.approach_cells(hand, np.array([upright, upside_down]))
     assert low // 12 == 0 and high // 12 == 3
-    assert cells_of(np.array([[-1.0, -1e-9, -0.9], [1.0, 0, 0.1]])).tolist() == [0, 2 * 12 + 6]
+    assert direction_cells(np.array([[-1.0, -1e-9, -0.9], [1.0, 0, 0.1]])).tolist() == [0, 2 * 12 + 6]
 
 
 def pattern(normals: list[tuple[float, float, float]], width: float = 0.05, **how: object) -> ContactPattern:

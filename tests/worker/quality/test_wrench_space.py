@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from graspd.worker.quality import wrench_space
-from graspd.worker.quality.wrench_space import MAX_POINTS, cone_edges, measure_hulls, measure_spaces, wrenches
+from graspd.worker.quality.wrench_space import MAX_POINTS, cone_edges, contact_wrenches, measure_hulls, measure_spaces
 
 #: The table of reference values is printed with six digits.
 PRINTED = 1e-5
@@ -37,7 +37,9 @@ def hull_of(points: np.ndarray, whole: bool = True) -> tuple[float, float]:
 
 
 def sphere_space(points: np.ndarray, friction: float, *, radius: float = 1.0, edges: int = 8) -> tuple[float, float]:
-    return measure_space(wrenches(points, -points, friction=friction, centre=ORIGIN, radius=radius, edges=edges))
+    return measure_space(
+        contact_wrenches(points, -points, friction=friction, centre=ORIGIN, radius=radius, edges=edges)
+    )
 
 
 def test_spaces_of_closed_form() -> None:
@@ -50,7 +52,7 @@ def test_spaces_of_closed_form() -> None:
     assert measure_space(cone_edges(opposed, 0.5)) == pytest.approx(pyramid, abs=PRINTED)
     assert sphere_space(opposed, 0.5) == (0.0, 0.0)
     # Face centres of a cube.
-    edges = wrenches(0.05 * OCTAHEDRON, -OCTAHEDRON, friction=0.5, centre=ORIGIN, radius=0.05 * math.sqrt(3))
+    edges = contact_wrenches(0.05 * OCTAHEDRON, -OCTAHEDRON, friction=0.5, centre=ORIGIN, radius=0.05 * math.sqrt(3))
     assert measure_space(edges) == pytest.approx((0.235702, 0.115207), abs=PRINTED)
 
 
@@ -77,8 +79,8 @@ def test_size_order_and_rotation_of_contacts_do_not_matter() -> None:
     turned = np.einsum("ab,neb->nea", np.kron(np.eye(2), turn), edges)[rng.permutation(7)]
     assert measure_space(turned) == pytest.approx(measure_space(edges), abs=JOGGLE)
     points = Rotation.random(6, rng=4).apply([0, 0, 1.0])
-    small = wrenches(0.03 * points, -points, friction=0.5, centre=ORIGIN, radius=0.04)
-    large = wrenches(3.0 * points, -points, friction=0.5, centre=ORIGIN, radius=4.0)
+    small = contact_wrenches(0.03 * points, -points, friction=0.5, centre=ORIGIN, radius=0.04)
+    large = contact_wrenches(3.0 * points, -points, friction=0.5, centre=ORIGIN, radius=4.0)
     assert np.allclose(small, large, atol=1e-12)
 
 
@@ -115,7 +117,7 @@ def contacts(count: int, friction: float = 1.0, seed: int = 0) -> np.ndarray:
     """(8 count, 6) edge wrenches of contacts on an ellipsoid: eight at a time are coplanar."""
     normals = Rotation.random(count, rng=seed).apply([0, 0, 1.0])
     points = -normals * np.array([1.0, 0.7, 0.4])
-    return wrenches(points, normals, friction=friction, centre=np.zeros(3), radius=1.0).reshape(-1, 6)
+    return contact_wrenches(points, normals, friction=friction, centre=np.zeros(3), radius=1.0).reshape(-1, 6)
 
 
 def test_radius_and_volume_are_qhull_s() -> None:

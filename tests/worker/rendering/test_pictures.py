@@ -15,7 +15,7 @@ from graspd.commands.grasp_sheet import waypoints
 from graspd.exchange.robots.execution import POSTURES, Executions, ToolFrame, straight_paths, time_motions
 from graspd.readers import hand_surface
 from graspd.service.model.errors import InputError
-from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec, supports_in
+from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec, scene_supports
 from graspd.service.model.transforms import apply, compose, invert, quat_rotate
 from graspd.service.readers import Pictures, open_shards
 from graspd.service.readers.trajectories import Waypoint
@@ -44,7 +44,7 @@ REST = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
 TABLE_SCENE = PictureScenes((HalfSpace(),), REST)
 DOWN = np.array([0, 0, 0.06, 0, 1.0, 0, 0])
 SECONDS = [0.5, 0.05, 1.2]
-SPECS = {kind: supports_in(SceneSpec(kind=kind)) for kind in ("table", "bin", "shelf")}
+SPECS = {kind: scene_supports(SceneSpec(kind=kind)) for kind in ("table", "bin", "shelf")}
 SHAPE = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
 RED = '<material name="red"><color rgba="1 0 0 1"/></material>'
 SEEN = (

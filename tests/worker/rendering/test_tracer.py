@@ -80,7 +80,7 @@ def of_one(camera: np.ndarray) -> CameraShot:
 def traced(solids: list[Solid | Box], poses: np.ndarray, what: CameraShot, looks: Sequence[Appearance] = LOOKS):
     tracer = Tracer(solids, "cpu")
     tracer.place(poses, [[*looks, *[Appearance((1.0, 1.0, 1.0))] * (len(solids) - len(looks))]] * len(poses))
-    return tracer.shoot(what)
+    return tracer.render(what)
 
 
 def box_distance(box: Box, pose: np.ndarray, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:

@@ -152,7 +152,7 @@ def test_neighbours_stand_where_the_file_says() -> None:
     scenes, poses = scenes_of(file_scene(*places), cube(), [cube(), cube()], count=2, seed=0)
     np.testing.assert_allclose(poses["scene/neighbour_pose"][1, :, :3], places)
     placed = scenes.placed(np.zeros(1, int))
-    np.testing.assert_allclose(placed.neighbours_of(0)[0, :3], [0.1, 0, 0])
+    np.testing.assert_allclose(placed.relative_neighbour_poses(0)[0, :3], [0.1, 0, 0])
     box = placed.scenes[0].obstacles[1]
     np.testing.assert_allclose(box.distance(np.array([0.05, 0.0, 0.0])), 0.025, atol=1e-9)
 

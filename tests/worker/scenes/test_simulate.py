@@ -17,8 +17,8 @@ from graspd.worker.scenes import drop, simulate
 from graspd.worker.scenes.kinds import GAP, rest_poses, supports_of, walled_area
 from graspd.worker.scenes.neighbours import BETWEEN, drop_together
 from graspd.worker.scenes.placement import gaps_between, neighbour_of, scenes_of
-from graspd.worker.scenes.rest import RestingFaces, resting_faces, rolling_note, rolling_poses
-from graspd.worker.scenes.simulate import REACH, _build
+from graspd.worker.scenes.rest import RestingFaces, count_rolling_poses, resting_faces, rolling_note
+from graspd.worker.scenes.simulate import REACH, _build_table
 from tests.worker.models import object_from_mesh
 
 #: Rest poses are computed in float64 from hull vertices of size 0.1 m.
@@ -52,7 +52,7 @@ def overhang(obj: ObjectModel, pose: np.ndarray) -> float:
 
 def test_a_drop_has_the_inertia_of_the_mesh_and_ends_on_the_table_near_the_middle():
     obj = bracket()
-    body = _build(obj).model.body("0")
+    body = _build_table(obj).model.body("0")
     mass = float(body.mass[0])
     expected = np.sort(np.linalg.eigvalsh(obj.inertia))
     np.testing.assert_allclose(np.sort(body.inertia) / mass, expected, rtol=1e-9)
@@ -114,8 +114,8 @@ def dropped(monkeypatch, own_cache) -> list[tuple[int, int]]:
     """Keys of the drops that are simulated, with a disk cache of their own and none in memory."""
     monkeypatch.setattr(simulate, "REFERENCE_DROPS", 8)
     keys: list[tuple[int, int]] = []
-    whole = simulate._redo_until_rest
-    monkeypatch.setattr(simulate, "_redo_until_rest", lambda table, key: keys.append(key) or whole(table, key))
+    whole = simulate._drop_until_rest
+    monkeypatch.setattr(simulate, "_drop_until_rest", lambda table, key: keys.append(key) or whole(table, key))
     monkeypatch.setattr(simulate, "_reference_faces", simulate._reference_faces.__wrapped__)
     return keys
 
@@ -170,12 +170,12 @@ def test_plate_topples_from_an_edge_whose_tilt_passes_its_middle() -> None:
 
 def test_a_can_rolls_on_its_side_and_stands_on_its_bottom() -> None:
     obj, faces = rolling_can(), resting_faces(rolling_can())
-    angle, sinks = faces.looseness(face_along(faces, (1, 0, 0)))
+    angle, sinks = faces.possible_motion(face_along(faces, (1, 0, 0)))
     assert angle > np.radians(170)
     assert sinks == pytest.approx(0.0, abs=1e-6)
-    assert faces.looseness(face_along(faces, (0, 0, 1)))[0] < np.radians(1)
+    assert faces.possible_motion(face_along(faces, (0, 0, 1)))[0] < np.radians(1)
     lying, standing = [0.0, 0, 0.03, np.sqrt(0.5), 0, np.sqrt(0.5), 0], [0.0, 0, 0.05, 1, 0, 0, 0]
-    assert rolling_poses(obj, np.array([lying, standing, lying])) == 2
+    assert count_rolling_poses(obj, np.array([lying, standing, lying])) == 2
     assert "in 2 of 3 scenes" in str(rolling_note(2, 3))
     assert rolling_note(0, 3) is None
 
@@ -202,7 +202,7 @@ def test_what_rolls_or_topples_is_put_on_its_ends(obj: ObjectModel, height: floa
 
 def test_a_ball_stays_as_it_lies() -> None:
     ball = object_from_mesh(trimesh.creation.icosphere(2, 0.03))
-    assert rolling_poses(ball, drop(ball, count=3, seed=1)["scene/object_pose"]) == 3
+    assert count_rolling_poses(ball, drop(ball, count=3, seed=1)["scene/object_pose"]) == 3
 
 
 @pytest.mark.parametrize("kind", ["table", "bin", "shelf"])

@@ -25,7 +25,7 @@ from graspd.worker.planners import PlanRequest
 from graspd.worker.planners.fast_graspd import planner
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.simulation import launches, reference
-from graspd.worker.simulation.data import Data, HandState, allocate_contacts, still_schedule
+from graspd.worker.simulation.data import Data, HandState, allocate_contacts, zero_schedule
 from graspd.worker.simulation.device import DeviceHand, DeviceObject
 from graspd.worker.simulation.kernels import packing, wrenches
 from graspd.worker.simulation.kernels import projection as kernels
@@ -301,10 +301,10 @@ def projection() -> Projection:
 def equations_of(state: HandState) -> Projection:
     """Residuals and equations of a state, without a step."""
     out = projection()
-    out.data.set_schedule(still_schedule())
+    out.data.set_schedule(zero_schedule())
     out.data.set_state(state)
     out._depth.fill_(np.inf)
-    launches = out._validated(out._states(state), out._states(state))
+    launches = out._record_depths(out._states(state), out._states(state))
     out._add_equations(launches)
     launches.run()
     return out

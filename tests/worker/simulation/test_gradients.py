@@ -307,7 +307,7 @@ SCENES = {
 def distances(hand: HandModel, state: HandState, obstacle: Obstacle) -> np.ndarray:
     """(F,) signed distance of each feature from an obstacle in float64, the object's centre being the origin."""
     posture = Posture(root_poses(hand, state), hand.expand(state.q))
-    return PosedFeatures.of(hand, posture).distance(obstacle)[0]
+    return PosedFeatures.create(hand, posture).distance(obstacle)[0]
 
 
 def kept(hand: HandModel, obstacle: Obstacle) -> np.ndarray:
@@ -372,7 +372,7 @@ def test_depth_is_what_the_nearest_feature_lacks_of_its_margin(name: str, scene:
     may_touch = np.isin(hand.features.body, hand.fingertips) & (table.tips_m is not None)
     lack = kept(hand, table) + np.where(may_touch, room / 4, room) - distances(hand, reaching(hand), table)
     # float32 coordinates of 0.1 m.
-    np.testing.assert_allclose(data.deepest(1)[0], max(0.0, float(lack.max())), atol=1e-6)
+    np.testing.assert_allclose(data.deepest_penetration(1)[0], max(0.0, float(lack.max())), atol=1e-6)
     data.set_scenes(np.full(1, -1))
     data.set_state(reaching(hand))
     record_placement(model, data, room=room).run()

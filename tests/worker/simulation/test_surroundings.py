@@ -105,7 +105,7 @@ def test_many_hands_have_the_room_of_each_ones_scene(name: str) -> None:
     one, other = Obstacle.half_space([0.3, -0.5, 0.8], -0.1), Obstacle.half_space([0, 1, 0], 0.05)
     up, which = np.array([0.0, 0, 1]), np.arange(9) % 3
     scenes = [Environment((one,), up), Environment((one, other), up), Environment((), up)]
-    posed = PosedFeatures.of(hand, postures)
+    posed = PosedFeatures.create(hand, postures)
     wanted = np.full(9, np.inf)
     for number, around in enumerate([[one], [one, other], []]):
         for obstacle in around:
@@ -429,13 +429,13 @@ def test_a_box_has_six_planes_however_it_is_triangulated() -> None:
 @pytest.fixture
 def computed(own_cache, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
     shapes: list[tuple[int, ...]] = []
-    sampled = grids._sampled
+    sampled = grids._sample_field
 
     def watched(skin, shape: tuple[int, ...]):
         shapes.append(shape)
         return sampled(skin, shape)
 
-    monkeypatch.setattr(grids, "_sampled", watched)
+    monkeypatch.setattr(grids, "_sample_field", watched)
     return shapes
 
 
@@ -461,7 +461,7 @@ def test_another_cell_faces_or_binary_is_another_grid(computed: list, monkeypatc
     kept_grid()
     coarse = kept_grid(cell=0.01)
     kept_grid(alpha=1.0)
-    monkeypatch.setattr(grids, "binary_name", lambda module: "that of another processor")
+    monkeypatch.setattr(grids, "binary_identity", lambda module: "that of another processor")
     kept_grid()
     assert len(computed) == 4 and coarse["field"].size < kept_grid()["field"].size
 

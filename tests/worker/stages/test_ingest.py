@@ -35,13 +35,13 @@ from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.pinch_postures import oppositions_of
+from graspd.worker.hands.pinch_postures import pinch_postures_of
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages import hand_self_test, ingest
 from graspd.worker.stages.context import StopReason, TaskContext
 from graspd.worker.stages.hand_self_test import SelfTest, fitting_width, plain_objects, self_test, self_test_facts
-from graspd.worker.validation.payload import Limit
+from graspd.worker.validation.payload import PayloadLimit
 from tests.api.factories import zipped
 from tests.damage import flipped
 from tests.worker.hands.urdfs import OPENING, gripper, gripper_urdf, joint, link, robot
@@ -337,7 +337,7 @@ def test_verdict_is_that_of_tables_and_tells_of_weak_free_grasps() -> None:
 
 
 def test_what_a_hand_lifts_at_best_is_a_line_of_its_check() -> None:
-    limit = Limit("claw", 0.6, 16, 1.44, 4.53)
+    limit = PayloadLimit("claw", 0.6, 16, 1.44, 4.53)
     held = SelfTest(0.91, 64, 0.04, {"box": 0.9}, 0.8, 16, limit=limit)
     facts = held.facts()
     assert (facts["table_n"], facts["limit"]["lifts_kg"], facts["limit"]["bound_kg"]) == (16, 1.44, 4.53)
@@ -364,10 +364,10 @@ def test_a_finger_of_one_joint_reaches_to_its_pad() -> None:
 
 def test_objects_are_no_thinner_than_opposed_pads_come_together(monkeypatch: pytest.MonkeyPatch) -> None:
     hand = hand_from_path("barrett")
-    known, width = oppositions_of(hand), fitting_width(hand)
+    known, width = pinch_postures_of(hand), fitting_width(hand)
     assert known.width[0] < width
     thick = replace(known, width=known.width + 0.03)
-    monkeypatch.setattr("graspd.worker.stages.hand_self_test.oppositions_of", lambda hand: thick)
+    monkeypatch.setattr("graspd.worker.stages.hand_self_test.pinch_postures_of", lambda hand: thick)
     assert fitting_width(hand) == pytest.approx(thick.width[0])
     assert width < thick.width[0] < hand_self_test.WIDTH_M[1]
 
@@ -380,7 +380,7 @@ def test_a_busy_machine_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> N
         run.check("planning")
         return [held(count)]
 
-    monkeypatch.setattr(hand_self_test, "_batches", batches)
+    monkeypatch.setattr(hand_self_test, "_plan_batches", batches)
     monkeypatch.setattr(hand_self_test, "_test_lifts", lambda hand, obj, count, run: (count, 0.5, None))
     found = self_test_facts(gripper)
     assert (found["table_n"], found["table"]) == (16, 0.5)

@@ -14,9 +14,9 @@ from graspd.service.model.digests import digest_bytes, job_id
 from graspd.service.model.domain import Asset, JobOptions, JobRequest
 from graspd.service.model.errors import DamagedShard, TaskCancelled
 from graspd.service.model.messages import IngestMessage
-from graspd.service.model.planning import message_of, plan_tasks
+from graspd.service.model.planning import create_task_message, plan_tasks
 from graspd.service.model.records import AttemptRecord, JobRecord
-from graspd.service.model.scene_spec import has_table, scene_of, supports_in
+from graspd.service.model.scene_spec import build_scene_spec, has_table, scene_supports
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.readers import Grasps, Pictures, open_shards
@@ -70,7 +70,7 @@ def job_of(store: Store, span: int = 1, **request) -> JobRecord:
 def end_of(store: Store, job: JobRecord) -> Event:
     runner = Runner(STAGES, worker="w", publish=lambda event: None)
     for task in plan_tasks(job):
-        message = message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
+        message = create_task_message(job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
         event = runner.run(message, TaskContext(store, ExecutionContext(threads=2)))
         if event.kind is not EventKind.FINISHED:
             break
@@ -160,10 +160,10 @@ def test_neighbours_in_a_bin_stand_in_scenes_grasps_and_pictures(table: Bench) -
 
 
 def render_alone(bench: Bench, base: Shard) -> dict:
-    message = message_of(bench.job, list(plan_tasks(bench.job))[-1], attempt=1, max_attempt=3)
+    message = create_task_message(bench.job, list(plan_tasks(bench.job))[-1], attempt=1, max_attempt=3)
     request, obj = bench.job.request, object_of(bench.store, message)
     options = {"views": 1, "stereo": False, "width": request.width, "height": request.height}
-    extras = Extras(supports=supports_in(request.place))
+    extras = Extras(supports=scene_supports(request.scene_spec))
     return pictures(obj, np.asarray(base["scene/object_pose"]), **options, seed=batch_seed(message), extras=extras)
 
 
@@ -272,7 +272,7 @@ def test_range_tells_how_far_it_is_and_stops_where_it_is_told_to(monkeypatch: py
     monkeypatch.setattr("graspd.worker.stages.context.REPORT_EVERY_S", 0.0)
     store = open_store("memory://")
     job, _ = made(store, 2, grasps=2 * SIZE, want="candidates")
-    message = message_of(job, next(plan_tasks(job)), attempt=1, max_attempt=1)
+    message = create_task_message(job, next(plan_tasks(job)), attempt=1, max_attempt=1)
     told: list[float] = []
 
     def tell(done: float, total: float, _: str) -> None:
@@ -344,12 +344,12 @@ def test_the_grasps_of_a_job_are_those_of_synth_with_the_file(store: Store, netw
     own = local_options("learned", {"network": str(tmp_path / "net.npz"), "starts": 2})
     assert own["network"] == digest_bytes(files[NETWORK_FILE]) != network.digest
     request = JobOptions(**LEARNED, options=own)
-    alone = synthesize_grasps("barrett", "block", request, place=request.place, scenes=2, device="cpu", threads=2)
+    alone = synthesize_grasps("barrett", "block", request, place=request.scene_spec, scenes=2, device="cpu", threads=2)
     assert set(made.arrays) == set(alone.arrays) and len(made["grasp/hand_pose"]) == 3
     for name, values in alone.arrays.items():
         np.testing.assert_array_equal(made[name], values, err_msg=name)
     without = JobOptions(**{**LEARNED, "method": "fast_graspd"})
-    other = synthesize_grasps("barrett", "block", without, place=without.place, scenes=2, device="cpu", threads=2)
+    other = synthesize_grasps("barrett", "block", without, place=without.scene_spec, scenes=2, device="cpu", threads=2)
     assert (made["grasp/hand_pose"] != other.arrays["grasp/hand_pose"]).any(), "the network is followed"
 
 
@@ -364,7 +364,7 @@ def test_files_that_are_not_what_their_digest_says_fail_the_job(store: Store, ne
 
 def test_a_worker_reads_a_network_once(store: Store, network: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     job = job_of(store, **LEARNED, options={"network": network.digest})
-    message = message_of(job, next(plan_tasks(job)), attempt=1, max_attempt=3)
+    message = create_task_message(job, next(plan_tasks(job)), attempt=1, max_attempt=3)
     assets.cache_network(store, message)
     monkeypatch.setattr(assets, "load_asset_files", None)
     assets.cache_network(store, message)
@@ -393,8 +393,8 @@ def test_a_network_whose_finding_was_lost_is_checked_by_a_worker(store: Store, n
     ],
 )
 def test_scene_is_refused_at_door_where_planner_finds_no_table(scene) -> None:
-    place = JobOptions(scene=scene).place
-    assert place == scene_of(JobOptions(scene=scene).scene, faces="drawn", touch=0.0, beside=())
+    place = JobOptions(scene=scene).scene_spec
+    assert place == build_scene_spec(JobOptions(scene=scene).scene, faces="drawn", touch=0.0, beside=())
     try:
         table_height(supports_of(place))
     except Exception:

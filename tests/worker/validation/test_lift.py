@@ -23,7 +23,7 @@ from graspd.worker.validation import prescreening
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import RISING, RISING_S, Lift, LiftOutcome
 from graspd.worker.validation.lifting import KnownLifts, LiftLevel, lift_key, validate_lifts
-from graspd.worker.validation.model import FRICTION, HARD, MujocoOptions, build
+from graspd.worker.validation.model import FRICTION, HARD, MujocoOptions, build_scene
 from graspd.worker.validation.prescreening import PHYSICS, SLIPS, ShortTests
 from graspd.worker.validation.protocol import MAX_DISPLACEMENT_M, STAGE_S, Test
 from graspd.worker.validation.robust import validate_robustness
@@ -33,8 +33,8 @@ from graspd.worker.validation.variant import (
     Models,
     Variant,
     VariantLift,
-    displaced_grasp,
-    motion_of,
+    displace_grasp,
+    object_motion,
     restrict_to_support,
 )
 from tests.worker.models import object_from_mesh
@@ -74,7 +74,7 @@ def placed(count: int) -> PlacedGrasps:
 
 
 def lift_test() -> Lift:
-    return Lift(build(HAND, BOX, WHOLE, MujocoOptions(), PLACED.supports), PLACED)
+    return Lift(build_scene(HAND, BOX, WHOLE, MujocoOptions(), PLACED.supports), PLACED)
 
 
 @pytest.mark.parametrize("level", ["dexgraspbench", "lift"])
@@ -109,7 +109,7 @@ def test_fingertips_press_into_the_table_as_deep_as_it_says(tips_m: float | None
     down = obstacle_clearance(HAND, given.grasp, PLACED.scenes)[0] + 0.0008
     for part in (given.grasp.hand_pose, given.pregrasp.hand_pose, given.squeeze.hand_pose, given.approach[0]):
         part[:, 2] += down
-    found = Lift(build(HAND, BOX, WHOLE, MujocoOptions(), placed.supports), placed).lift(given, 0)
+    found = Lift(build_scene(HAND, BOX, WHOLE, MujocoOptions(), placed.supports), placed).lift(given, 0)
     assert (found.outcome is LiftOutcome.TOUCHED_ON_THE_WAY) == touched
 
 
@@ -120,7 +120,9 @@ def test_a_box_with_its_origin_elsewhere_is_lifted_alike() -> None:
     pose = PLACED.object_pose.copy()
     pose[:, :3] -= quat_rotate(pose[:, 3:], away)
     placed = PlacedGrasps(PLACED.supports, pose, PLACED.index)
-    scene = build(HAND, box, ConvexPieces((box.hull_vertices,), 1.0, 0.0, "box"), MujocoOptions(), placed.supports)
+    scene = build_scene(
+        HAND, box, ConvexPieces((box.hull_vertices,), 1.0, 0.0, "box"), MujocoOptions(), placed.supports
+    )
     test, given = Lift(scene, placed), grasp(0.05)
     for part in (given.grasp, given.pregrasp, given.squeeze, given.lift):
         part.hand_pose[:, :3] += away
@@ -128,10 +130,10 @@ def test_a_box_with_its_origin_elsewhere_is_lifted_alike() -> None:
     # Where the object is follows its mesh's origin, which a turn moves more where it is farther from the centre.
     assert test.lift(given, 0).margin == pytest.approx(lift_test().lift(grasp(0.05), 0).margin, abs=0.02)
     # Nobody near: what stands on a table keeps standing for a second. A contact gives by 0.1 mm.
-    test._begin(given, 0)
-    test._put(given.grasp.hand_pose[0] - [0, 0, 1, 0, 0, 0, 0], given.coming[0])
+    test._set_up_scene(given, 0)
+    test._set_posture(given.grasp.hand_pose[0] - [0, 0, 1, 0, 0, 0, 0], given.coming[0])
     test._run(1.0)
-    moved, turned = test._motion()
+    moved, turned = test._object_motion()
     assert moved < 5e-4 and turned < 1e-3
 
 
@@ -140,7 +142,7 @@ def beside(place: tuple[float, float], size: tuple[float, float, float], mass: f
     neighbour = Neighbour(other, (other.hull_vertices,), (), 0.0)
     pose = np.array([[[*place, size[2] / 2, 1.0, 0, 0, 0]]])
     placed = replace(PLACED, neighbours=(neighbour,), neighbour_pose=pose)
-    return Lift(build(HAND, BOX, WHOLE, MujocoOptions(), placed.supports, placed.neighbours), placed)
+    return Lift(build_scene(HAND, BOX, WHOLE, MujocoOptions(), placed.supports, placed.neighbours), placed)
 
 
 def test_a_neighbour_counts_only_where_the_hand_comes_through_it() -> None:
@@ -156,7 +158,7 @@ def test_a_neighbour_counts_only_where_the_hand_comes_through_it() -> None:
 def test_neighbour_has_its_own_mass_which_moves_the_key_of_lifts() -> None:
     light, heavy = (beside((0.0, 0.3), (0.05, 0.05, 0.1), mass) for mass in (0.05, 2.0))
     for test, mass in ((light, 0.05), (heavy, 2.0)):
-        test._begin(grasp(0.05), 0)
+        test._set_up_scene(grasp(0.05), 0)
         (free,) = test.scene.neighbours
         assert free.mass == pytest.approx(mass)
         assert np.linalg.norm(test.data.xfrc_applied[free.body]) == pytest.approx(ACCELERATION * mass)
@@ -166,12 +168,12 @@ def test_neighbour_has_its_own_mass_which_moves_the_key_of_lifts() -> None:
 
 def test_a_neighbour_that_leans_or_slides_has_moved() -> None:
     test = beside((0.0, 0.3), (0.05, 0.05, 0.1))
-    test._begin(grasp(0.05), 0)
+    test._set_up_scene(grasp(0.05), 0)
     free = test.scene.neighbours[0]
     turned = np.array([np.cos(np.radians(8)), np.sin(np.radians(8)), 0, 0])
     test.data.qpos[free.qpos + 3 : free.qpos + 7] = quat_multiply(test._beside[0][3:], turned)
     assert test._neighbours_moved()
-    test._begin(grasp(0.05), 0)
+    test._set_up_scene(grasp(0.05), 0)
     about = np.array([np.cos(0.5), 0, 0, np.sin(0.5)])
     test.data.qpos[free.qpos + 3 : free.qpos + 7] = quat_multiply(test._beside[0][3:], about)
     assert not test._neighbours_moved()
@@ -277,7 +279,7 @@ def test_half_the_friction_is_the_hard_lift() -> None:
 
 def test_a_heavier_object_weighs_more_and_takes_more_to_lift() -> None:
     test = VariantLift(models().scene(Variant(mass=2.0)), PLACED, Variant(mass=2.0), None)
-    test._begin(MANY, 0)
+    test._set_up_scene(MANY, 0)
     weight = test.data.xfrc_applied[test.scene.object_body, :3]
     assert weight == pytest.approx(2.0 * test.scene.push_force * np.array([0, 0, 1.0]))
     lifted = [models().lift(MANY, 2, WHERE, Variant(mass=mass)).success for mass in (1.0, 2.0)]
@@ -291,7 +293,7 @@ def test_an_object_that_stands_off_slides_and_the_hand_stays() -> None:
     assert variant.object_shift_m[:2] == (0.001, -0.0015)
     assert np.cross(variant.object_turn, up) == pytest.approx([0, 0, 0], abs=1e-12)
     assert np.linalg.norm(variant.object_turn) == pytest.approx(0.02)
-    one, motion = displaced_grasp(BOX, MANY, 5, variant), motion_of(BOX, variant)
+    one, motion = displace_grasp(BOX, MANY, 5, variant), object_motion(BOX, variant)
     # Hand, seen from where the object stands, and from where it was thought to be: the same place in the world.
     pregrasps = one.pregrasp.hand_pose[0], MANY.pregrasp.hand_pose[5]
     for now, thought in (pregrasps, (one.approach[0, 0], MANY.approach[5, 0])):

@@ -20,7 +20,14 @@ from graspd.worker.validation import payload as heaviest
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.lifting import validate_lifts
-from graspd.worker.validation.payload import ENOUGH, Limit, capacities, limit_of, payloads, shake_margins
+from graspd.worker.validation.payload import (
+    ENOUGH,
+    PayloadLimit,
+    load_capacities,
+    payload_limit,
+    payloads,
+    shake_margins,
+)
 from tests.worker.commands_run import graspd
 from tests.worker.models import object_from_mesh, two_finger_hand
 
@@ -67,12 +74,12 @@ def test_the_payload_of_a_pinch_is_what_its_friction_bears(friction: float) -> N
 def test_the_worst_direction_counts_and_what_is_out_of_touch_bears_nothing() -> None:
     assert np.isnan(payload(0.01))
     away = Posture(pinch().grasp.hand_pose - np.eye(7)[2], pinch().grasp.joint_positions)
-    assert capacities(HAND, BOX, away, UP).tolist() == [0.0]
+    assert load_capacities(HAND, BOX, away, UP).tolist() == [0.0]
     at_stop = replace(HAND, lower=np.full(2, -heaviest.AT_STOP * 1e-3))
-    assert not np.isfinite(capacities(at_stop, BOX, pinch().grasp, UP)).any()
+    assert not np.isfinite(load_capacities(at_stop, BOX, pinch().grasp, UP)).any()
     # Along the line of the fingers one of them presses with all its effort, the other not at all.
     along = np.array([[[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]])
-    assert capacities(HAND, BOX, pinch().grasp, along) == pytest.approx(TORQUE / LEVER_M / ACCELERATION, rel=0.01)
+    assert load_capacities(HAND, BOX, pinch().grasp, along) == pytest.approx(TORQUE / LEVER_M / ACCELERATION, rel=0.01)
 
 
 @pytest.mark.parametrize("friction", [0.3, FRICTION, 1.0])
@@ -143,14 +150,14 @@ def test_a_job_counts_grasps_that_lift_the_wanted_payload(tmp_path, least, kept:
 
 @pytest.mark.parametrize("friction", [0.01, 0.3, FRICTION, 1.0])
 def test_pinch_could_bear_what_pyramids_around_its_cones_bear(friction: float) -> None:
-    found = capacities(HAND, BOX.with_mass(friction=friction), pinch().grasp, UP)
+    found = load_capacities(HAND, BOX.with_mass(friction=friction), pinch().grasp, UP)
     assert found == pytest.approx(bears(friction) / math.cos(math.pi / EDGES), rel=2e-3)
 
 
 def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
-    def limit(wanted: float, count: int = ENOUGH) -> Limit | None:
+    def limit(wanted: float, count: int = ENOUGH) -> PayloadLimit | None:
         rows = np.zeros(count, int)
-        return limit_of(HAND, BOX, pinch().take(rows), pieces=PIECES, placed=TABLE.take(rows), wanted=wanted)
+        return payload_limit(HAND, BOX, pinch().take(rows), pieces=PIECES, placed=TABLE.take(rows), wanted=wanted)
 
     lifts = bears(FRICTION)
     found = limit(3 * lifts)

@@ -12,9 +12,9 @@ import trimesh
 from benchmarks.foreign import with_our_shapes, with_their_shapes
 from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.matter import MASS_KG
-from graspd.service.model.metrics import Axis
+from graspd.service.model.metrics import PerturbedParameter
 from graspd.service.model.transforms import IDENTITY_POSE, apply
-from graspd.studies.evaluation import combine, evaluate
+from graspd.studies.evaluation import combine_rows, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.hand_matching import match_hands
@@ -24,13 +24,13 @@ from graspd.worker.hands.tendons import Tendon
 from graspd.worker.validation import model
 from graspd.worker.validation import robust as robustness
 from graspd.worker.validation import variant as variants
-from graspd.worker.validation.foreign import transfer_grasps, with_drives_of
+from graspd.worker.validation.foreign import transfer_drives, transfer_grasps
 from graspd.worker.validation.key import verdict_key
-from graspd.worker.validation.model import MujocoOptions, Scene, build
+from graspd.worker.validation.model import MujocoOptions, Scene, build_scene
 from graspd.worker.validation.prefilter.prefilter import prefilter_key_terms
 from graspd.worker.validation.protocol import STAGES, Outcome, Rollout, Test
-from graspd.worker.validation.refit import fits_of, offset_piece, refit_hand
-from graspd.worker.validation.robust import Robustness, models_of, needed_models, validate_robustness
+from graspd.worker.validation.refit import applicable_fits, offset_piece, refit_hand
+from graspd.worker.validation.robust import Robustness, draw_models, required_model_count, validate_robustness
 from graspd.worker.validation.validator import validate
 from graspd.worker.validation.variant import (
     NOMINAL,
@@ -38,7 +38,7 @@ from graspd.worker.validation.variant import (
     Variant,
     VariantTest,
     axes_of,
-    displaced_grasp,
+    displace_grasp,
     draw_variant,
     replace_coupling,
 )
@@ -70,14 +70,16 @@ def test_in_models_that_are_all_same_grasp_holds_in_all_or_none(monkeypatch: pyt
     found = validate_robustness(PADS, BOX, grasps, models=3, pieces=WHOLE)
     verdicts = validate(PADS, BOX, grasps, pieces=WHOLE)
     assert found.share.tolist() == verdicts.success.tolist() and {0.0, 1.0} == set(found.share)
-    assert ((found.weakest == Axis.NONE) == (verdicts.success == 1)).all()
+    assert ((found.weakest == PerturbedParameter.NONE) == (verdicts.success == 1)).all()
 
 
 def test_only_what_holds_in_the_nominal_model_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     by_luck(monkeypatch)
     held = np.array([1, 0, 1, -1, 0, 1, 1, 1])
     found = validate_robustness(PADS, BOX, many_grasps(), held=held, models=4, pieces=WHOLE)
-    assert (np.isfinite(found.share) == (held == 1)).all() and (found.weakest[held != 1] == Axis.NONE).all()
+    assert (np.isfinite(found.share) == (held == 1)).all() and (
+        found.weakest[held != 1] == PerturbedParameter.NONE
+    ).all()
 
 
 @pytest.mark.parametrize("models", [1, 8])
@@ -111,26 +113,30 @@ def test_the_weakest_axis_is_that_of_the_first_model_that_fails() -> None:
     found = Robustness(held, np.array([[1, 4, 5], [2, 3, 4], [7, 0, 0], [0, 0, 0]], np.uint8), 0.9, 0.0)
     assert found.weakest.tolist() == [4, 0, 7, 0]
     assert found.by_axis() == {
-        Axis.SHAPES: (1, 1), Axis.JOINTS: (1, 1), Axis.COUPLINGS: (1, 1), Axis.FRICTION: (1, 2), Axis.MASS: (0, 1),
-        Axis.POSE: (0, 1),
-    }  # fmt: skip
+        PerturbedParameter.SHAPES: (1, 1),
+        PerturbedParameter.JOINTS: (1, 1),
+        PerturbedParameter.COUPLINGS: (1, 1),
+        PerturbedParameter.FRICTION: (1, 2),
+        PerturbedParameter.MASS: (0, 1),
+        PerturbedParameter.POSE: (0, 1),
+    }
 
 
 @pytest.mark.parametrize(
     ("wanted", "models", "least"), [(0.9, 8, 8), (0.75, 8, 6), (0.9, 10, 9), (1.0, 3, 3), (0.1, 4, 1)]
 )
 def test_so_many_models_make_a_share(wanted: float, models: int, least: int) -> None:
-    assert needed_models(wanted, models) == least
+    assert required_model_count(wanted, models) == least
 
 
 def test_models_of_a_grasp_are_its_own_and_the_nominal_one_is_validated_alike() -> None:
     grasps = many_grasps()
     turned = grasps.take(np.arange(len(grasps))[::-1])
-    assert models_of(PADS, grasps, 2, 8, 5) == models_of(PADS, turned, len(grasps) - 3, 8, 5)
-    assert models_of(PADS, grasps, 2, 8, 5) == models_of(PADS, grasps, 2, 16, 5)[:8]
-    others = [models_of(PADS, grasps, 2, 8, 6), models_of(PADS, grasps, 3, 8, 5)]
-    assert models_of(PADS, grasps, 2, 8, 5) not in others
-    axes = [axis for axis, _ in models_of(PADS, grasps, 0, 8, 0)]
+    assert draw_models(PADS, grasps, 2, 8, 5) == draw_models(PADS, turned, len(grasps) - 3, 8, 5)
+    assert draw_models(PADS, grasps, 2, 8, 5) == draw_models(PADS, grasps, 2, 16, 5)[:8]
+    others = [draw_models(PADS, grasps, 2, 8, 6), draw_models(PADS, grasps, 3, 8, 5)]
+    assert draw_models(PADS, grasps, 2, 8, 5) not in others
+    axes = [axis for axis, _ in draw_models(PADS, grasps, 0, 8, 0)]
     assert sorted(axes) == sorted(axes_of(PADS)) and len(axes) == 8
     verdicts = validate(PADS, BOX, grasps, pieces=WHOLE)
     found = [models().standard(grasps, row, NOMINAL) for row in range(len(grasps))]
@@ -218,8 +224,8 @@ def test_the_primitive_nearest_to_the_hull_of_one_is_that_one(kind: str, size: t
 def test_fits_that_change_nothing_are_not_offered() -> None:
     hand = two_finger_hand()
     ball = dataclasses.replace(hand, pieces=tuple(p for p in hand.pieces if p.kind == "sphere"))
-    assert fits_of(ball) == frozenset()
-    assert "hull" in fits_of(hand), "a finger has a shaft and a tip"
+    assert applicable_fits(ball) == frozenset()
+    assert "hull" in applicable_fits(hand), "a finger has a shaft and a tip"
     assert len(refit_hand(hand, "hull").pieces) == 3 and refit_hand(ball, "capsule") is ball
 
 
@@ -257,7 +263,7 @@ def test_a_heavier_object_is_pushed_by_its_weight() -> None:
         test._close(grasps, 0)
         test._push(2)
         test._run(0.1)
-        moved.append(test._offset()[1])
+        moved.append(test._object_displacement()[1])
     # The same acceleration of 10 m/s^2, half a step of velocity added by the implicit step.
     assert moved == pytest.approx([0.5 * 10 * 0.1 * (0.1 + 0.004)] * 2, rel=1e-6)
 
@@ -269,16 +275,16 @@ def test_the_centre_of_mass_moves_and_the_object_stays() -> None:
     assert data.xipos[scene.object_body] == pytest.approx(BOX.centre_of_mass + shift, abs=1e-9)
     assert data.geom("object-0").xpos == pytest.approx(BOX.centre_of_mass, abs=1e-7)
     test = Test(scene)
-    scene.place(test.data, FAR, np.zeros(2))
-    assert test._offset() == pytest.approx([0, 0, 0], abs=1e-12), "the mesh's frame is where it was"
+    scene.set_posture(test.data, FAR, np.zeros(2))
+    assert test._object_displacement() == pytest.approx([0, 0, 0], abs=1e-12), "the mesh's frame is where it was"
 
 
 def test_object_or_a_hand_that_is_off_is_met_the_other_way_round() -> None:
     grasps = many_grasps()
     shift, turn = (0.001, -0.002, 0.0005), (0.0, 0.0, 0.03)
-    moved = displaced_grasp(BOX, grasps, 3, Variant(object_shift_m=shift))
+    moved = displace_grasp(BOX, grasps, 3, Variant(object_shift_m=shift))
     assert moved.pregrasp.hand_pose[0, :3] == pytest.approx(grasps.pregrasp.hand_pose[3, :3] - shift)
-    turned = displaced_grasp(BOX, grasps, 3, Variant(object_turn=turn)).grasp.hand_pose[0]
+    turned = displace_grasp(BOX, grasps, 3, Variant(object_turn=turn)).grasp.hand_pose[0]
     arm = grasps.grasp.hand_pose[3, :3] - BOX.centre_of_mass
     back = np.array([[np.cos(0.03), np.sin(0.03), 0], [-np.sin(0.03), np.cos(0.03), 0], [0, 0, 1]])
     assert turned[:3] == pytest.approx(BOX.centre_of_mass + back @ arm, abs=1e-12)
@@ -287,7 +293,7 @@ def test_object_or_a_hand_that_is_off_is_met_the_other_way_round() -> None:
     quarter = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
     for part in (grasps.grasp, grasps.pregrasp, grasps.squeeze):
         part.hand_pose[:, 3:] = quarter
-    off = displaced_grasp(BOX, grasps, 2, Variant(hand_shift_m=(0.002, 0, 0)))
+    off = displace_grasp(BOX, grasps, 2, Variant(hand_shift_m=(0.002, 0, 0)))
     assert off.grasp.hand_pose[0, :3] - grasps.grasp.hand_pose[2, :3] == pytest.approx([0, 0.002, 0], abs=1e-12)
 
 
@@ -306,7 +312,9 @@ def test_fingers_that_close_one_after_another_end_together() -> None:
 
 
 def test_a_compliant_coupling_gives_way_under_load() -> None:
-    assert Axis.COUPLINGS in axes_of(on_one_dof(two_finger_hand())) and Axis.COUPLINGS not in axes_of(two_finger_hand())
+    assert PerturbedParameter.COUPLINGS in axes_of(
+        on_one_dof(two_finger_hand())
+    ) and PerturbedParameter.COUPLINGS not in axes_of(two_finger_hand())
     apart = []
     around = models(on_one_dof(two_finger_hand()))
     for variant in (NOMINAL, Variant(coupling="compliant")):
@@ -318,10 +326,10 @@ def test_a_compliant_coupling_gives_way_under_load() -> None:
     assert apart[1] > 2 * apart[0] > 0
 
 
-@pytest.mark.parametrize("axis", [axis for axis in Axis if axis is not Axis.NONE])
-def test_a_draw_stays_in_the_range_of_its_axis(axis: Axis) -> None:
+@pytest.mark.parametrize("axis", [axis for axis in PerturbedParameter if axis is not PerturbedParameter.NONE])
+def test_a_draw_stays_in_the_range_of_its_axis(axis: PerturbedParameter) -> None:
     rng = np.random.default_rng(5)
-    hand = on_one_dof(two_finger_hand()) if axis is Axis.COUPLINGS else PADS
+    hand = on_one_dof(two_finger_hand()) if axis is PerturbedParameter.COUPLINGS else PADS
     drawn = [draw_variant(axis, hand, rng) for _ in range(60)]
     for one in drawn:
         assert 0.5 <= min(one.gain, one.damping, one.mass) <= max(one.gain, one.damping, one.mass) <= 2
@@ -329,7 +337,7 @@ def test_a_draw_stays_in_the_range_of_its_axis(axis: Axis) -> None:
         assert np.linalg.norm(one.centre_m) <= 5e-3 and np.linalg.norm(one.object_shift_m) <= 2e-3
         assert np.linalg.norm(one.object_turn) <= np.radians(2) and np.linalg.norm(one.hand_shift_m) <= 2e-3
         assert (one.fit, one.grown_m) in (*variants.SHAPES, ("own", 0.0))
-    assert len({repr(one) for one in drawn}) > (0 if axis is Axis.COUPLINGS else 1)
+    assert len({repr(one) for one in drawn}) > (0 if axis is PerturbedParameter.COUPLINGS else 1)
 
 
 def tied(second: float = 1.0) -> HandModel:
@@ -376,7 +384,7 @@ def test_a_ratio_keeps_what_both_can_do() -> None:
 
 def driven(hand: HandModel, begin: np.ndarray, aim: np.ndarray) -> tuple[Scene, mujoco.MjData]:
     """A hand far from everything whose dofs (D,) are driven to an aim."""
-    scene = build(hand, BOX, WHOLE, MujocoOptions())
+    scene = build_scene(hand, BOX, WHOLE, MujocoOptions())
     data = placed_data(scene, hand.expand(begin))
     scene.command(data, FAR, hand.expand(aim))
     return scene, data
@@ -427,7 +435,7 @@ def test_a_drive_stays_what_it_is_with_followers_or_on_a_tendon() -> None:
     ratio = load(text, root="palm", tendons={}, couplings={"left_curl": {"of": "left_bend"}})
     (cord,), dof = tendon.tendons, ratio.dof_names.index("left_bend")
     # Both joints by the same angle q change the tendon's length by 2 q: its gain K is 4 K to q, its limit F is 2 F.
-    forth, back = with_drives_of(match_hands(tendon, ratio)), with_drives_of(match_hands(ratio, tendon))
+    forth, back = transfer_drives(match_hands(tendon, ratio)), transfer_drives(match_hands(ratio, tendon))
     assert forth.stiffness[dof] == pytest.approx(4 * cord.gain(tendon.stiffness))
     assert forth.effort[dof] == pytest.approx(2 * cord.limit(tendon.effort))
     assert 4 * cord.gain(back.stiffness) == pytest.approx(ratio.stiffness[dof])
@@ -441,7 +449,7 @@ def test_the_same_model_gives_the_same_verdicts_and_rows_add_up(tmp_path) -> Non
     assert [one["held_foreign"] for one in row["verdicts"]] == [True, True, False]
     json.dumps(row, allow_nan=False)
     lost = {**row, "foreign_held": {"both": 0, "nominal": 1, "foreign": 1, "neither": 0}, "fingertips_mm": 0.4}
-    whole = combine([row, lost])
+    whole = combine_rows([row, lost])
     assert whole["foreign_held"] == {"both": 2, "nominal": 1, "foreign": 1, "neither": 1}
     assert (whole["agreement"], whole["foreign_share"]) == (pytest.approx(3 / 5), pytest.approx(2 / 3, abs=1e-6))
     assert whole["fingertips_mm"] == 0.4

@@ -25,7 +25,7 @@ from graspd.worker.validation import decomposition, model, protocol
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.displacement import GRAVITY, STEPS, TIMESTEP_S, simulated_displacement_cm
 from graspd.worker.validation.key import LEVEL_MOVES, MOVES, Level, verdict_key
-from graspd.worker.validation.model import MujocoOptions, blend, build, scene_of
+from graspd.worker.validation.model import MujocoOptions, build_scene, interpolate_postures, scene_of
 from graspd.worker.validation.protocol import HOLD_S, MAX_DISPLACEMENT_M, MAX_ROTATION, Outcome, Rollout, Test
 from graspd.worker.validation.validator import validate
 from tests.worker.models import object_from_mesh, on_one_dof, two_finger_hand
@@ -49,11 +49,11 @@ def test_a_pressed_box_is_held_and_a_free_one_falls() -> None:
 
 def test_the_box_slips_at_friction_0_04_and_holds_at_0_06() -> None:
     # Two pads of 10 N give 0.8 N of friction against a push of 1 N across; along their normals they need none.
-    scene = build(PADS, BOX, WHOLE, MujocoOptions(friction=(0.04, 0.001)))
+    scene = build_scene(PADS, BOX, WHOLE, MujocoOptions(friction=(0.04, 0.001)))
     rollout = Test(scene).dexgraspbench(grasp_of(), 0)
     assert rollout.outcomes[:3] == [Outcome.HELD, Outcome.HELD, Outcome.DISPLACED]
     # 1.2 N of friction against 1 N.
-    scene = build(PADS, BOX, WHOLE, MujocoOptions(friction=(0.06, 0.001)))
+    scene = build_scene(PADS, BOX, WHOLE, MujocoOptions(friction=(0.06, 0.001)))
     assert Test(scene).dexgraspbench(grasp_of(), 0).success
 
 
@@ -68,7 +68,7 @@ def test_penetration_counts_at_pregrasp_where_simulation_starts(level: str) -> N
 
 
 def test_the_engine_has_the_numbers_of_hand_and_object() -> None:
-    model = build(PADS, BOX, WHOLE, MujocoOptions()).model
+    model = build_scene(PADS, BOX, WHOLE, MujocoOptions()).model
     fingers = [int(model.joint(f"joint{b}").dofadr[0]) for b in PADS.joint_body]
     assert model.dof_damping[fingers] == pytest.approx(0.02 * PADS.stiffness) and not model.dof_armature.any()
     assert not model.dof_frictionloss.any()
@@ -77,7 +77,7 @@ def test_the_engine_has_the_numbers_of_hand_and_object() -> None:
     assert body.mass[0] == pytest.approx(MASS_KG)
     assert sorted(body.inertia) == pytest.approx(sorted(MASS_KG * np.linalg.eigvalsh(BOX.inertia)), rel=1e-6)
     hand = two_finger_hand()
-    model = build(hand, BOX, WHOLE, MujocoOptions()).model
+    model = build_scene(hand, BOX, WHOLE, MujocoOptions()).model
     assert model.joint("joint1").range == pytest.approx([hand.lower[0], hand.upper[0]])
 
 
@@ -85,7 +85,7 @@ def test_the_engine_has_the_numbers_of_hand_and_object() -> None:
 def test_a_pair_of_pieces_has_one_contact_but_between_jaws(jaws: bool, contacts: int, monkeypatch) -> None:
     if not jaws:
         monkeypatch.setattr(model, "jaws_of", lambda hand: None)
-    scene = build(helpers.plate_hand(), BOX, WHOLE, MujocoOptions())
+    scene = build_scene(helpers.plate_hand(), BOX, WHOLE, MujocoOptions())
     data = placed_data(scene, CONTACT.joint_positions[0] + 1e-3, CONTACT.hand_pose[0])
     # A plate's face lies flat on the box: with multi-contact each of the two has four points.
     assert len(data.contact.dist) == contacts
@@ -95,26 +95,26 @@ def test_displacement_is_that_of_the_mesh_s_own_frame() -> None:
     mesh = trimesh.creation.box((0.06, 0.04, 0.05))
     mesh.apply_translation([0.3, 0, 0])
     far = object_from_mesh(mesh)
-    scene = build(PADS, far, ConvexPieces((far.hull_vertices,), 1.0, 0.0, "far"), MujocoOptions())
+    scene = build_scene(PADS, far, ConvexPieces((far.hull_vertices,), 1.0, 0.0, "far"), MujocoOptions())
     test = Test(scene)
-    scene.place(test.data, FAR, np.zeros(2))
-    assert test._motion() == (pytest.approx(0, abs=1e-12), 0)
+    scene.set_posture(test.data, FAR, np.zeros(2))
+    assert test._object_motion() == (pytest.approx(0, abs=1e-12), 0)
     angle = 0.2
     turned = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
     test.data.qpos[scene.object_qpos + 3 : scene.object_qpos + 7] = turned
     # Turned about its centre the box stays; the mesh's origin, 0.3 m away, does not.
-    assert test._motion() == (pytest.approx(2 * 0.3 * np.sin(angle / 2)), pytest.approx(angle))
+    assert test._object_motion() == (pytest.approx(2 * 0.3 * np.sin(angle / 2)), pytest.approx(angle))
 
 
 def test_the_root_turns_at_an_even_rate_between_two_postures() -> None:
     half = np.array([[0.0, 0, 0, 1, 0, 0, 0], [0.0, 0, 0, 0, 0, 0, 1.0]])
     a, b = (Posture(row[None], np.zeros((1, 2))) for row in half)
-    turns = [2 * np.arctan2(*blend(a, b, 0, share)[0][[6, 3]]) for share in (0.1, 0.5, 0.9)]
+    turns = [2 * np.arctan2(*interpolate_postures(a, b, 0, share)[0][[6, 3]]) for share in (0.1, 0.5, 0.9)]
     assert turns == pytest.approx([0.1 * np.pi, 0.5 * np.pi, 0.9 * np.pi])
 
 
 def test_push_from_the_saved_state_is_a_push_after_closing_anew() -> None:
-    grasps, test = many_grasps(), Test(build(PADS, BOX, WHOLE, MujocoOptions()))
+    grasps, test = many_grasps(), Test(build_scene(PADS, BOX, WHOLE, MujocoOptions()))
     ends = []
     for anew in (False, True):
         test._close(grasps, 3)
@@ -218,7 +218,7 @@ def _called(module, name: str) -> str:
 def test_forward_kinematics_agree_with_ours() -> None:
     hand = two_finger_hand()
     pose, joints = np.array([0.1, 0.2, -0.3, 0.5, -0.5, 0.5, 0.5]), np.array([0.4, -0.2])
-    data = placed_data(build(hand, BOX, WHOLE, MujocoOptions()), joints, pose)
+    data = placed_data(build_scene(hand, BOX, WHOLE, MujocoOptions()), joints, pose)
     ours = body_poses(hand, pose, joints)[0]
     for b in range(hand.bodies):
         assert data.body(f"body{b}").xpos == pytest.approx(ours[b, :3], abs=1e-12)
@@ -227,7 +227,7 @@ def test_forward_kinematics_agree_with_ours() -> None:
 
 def test_coupled_joints_stay_coupled_while_moving() -> None:
     hand = on_one_dof(PADS, 0.5, 0.01)
-    scene = build(hand, BOX, WHOLE, MujocoOptions())
+    scene = build_scene(hand, BOX, WHOLE, MujocoOptions())
     assert scene.model.nu == 1
     data = placed_data(scene, hand.expand(np.array([0.0])))
     scene.command(data, FAR, hand.expand(np.array([0.06])))
@@ -238,7 +238,7 @@ def test_coupled_joints_stay_coupled_while_moving() -> None:
 
 
 def test_actuators_never_exceed_the_effort() -> None:
-    scene = build(replace(PADS, effort=np.array([2.0, 3.0])), BOX, WHOLE, MujocoOptions())
+    scene = build_scene(replace(PADS, effort=np.array([2.0, 3.0])), BOX, WHOLE, MujocoOptions())
     data = placed_data(scene, CONTACT.joint_positions[0], CONTACT.hand_pose[0])
     scene.command(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 0.08)
     mujoco.mj_step(scene.model, data, nstep=5)
@@ -283,12 +283,12 @@ class Exploding(Test):
 @pytest.mark.parametrize("level", ["dexgraspbench", "standard"])
 def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(level: str, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    test = Exploding(build(PADS, BOX, WHOLE, MujocoOptions()))
+    test = Exploding(build_scene(PADS, BOX, WHOLE, MujocoOptions()))
     rollout = getattr(test, level)(grasp_of(), 0)
     assert rollout.outcomes[0] is Outcome.DIVERGED and not rollout.success
     # What the guard is for: after MuJoCo's reset the object stands where it began.
-    assert test._motion()[0] < 0.05 and is_invalid(test.data)
-    test._start(grasp_of(), 0)
+    assert test._object_motion()[0] < 0.05 and is_invalid(test.data)
+    test._set_up_test(grasp_of(), 0)
     assert not is_invalid(test.data)
     assert list(tmp_path.iterdir()) == [], "MuJoCo's warnings go to no file"
 
@@ -327,11 +327,11 @@ class Scripted(Test):
     def _run(self, seconds: float) -> None:
         self.elapsed += seconds
 
-    def _offset(self) -> np.ndarray:
+    def _object_displacement(self) -> np.ndarray:
         return np.array([MAX_DISPLACEMENT_M * self._moved(self.elapsed), 0.0, 0.0])
 
-    def _motion(self) -> tuple[float, float]:
-        return float(np.linalg.norm(self._offset())), MAX_ROTATION * self._turned(self.elapsed)
+    def _object_motion(self) -> tuple[float, float]:
+        return float(np.linalg.norm(self._object_displacement())), MAX_ROTATION * self._turned(self.elapsed)
 
 
 def still(time: float) -> float:

@@ -25,7 +25,7 @@ from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.port import PlanRequest
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.model import MujocoOptions, build
+from graspd.worker.validation.model import MujocoOptions, build_scene
 from graspd.worker.validation.prefilter import prefilter as screening
 from graspd.worker.validation.prefilter.prefilter import ROWS, PrefilterOutcomes, WorldPool
 from graspd.worker.validation.protocol import Outcome, ValidatedBy
@@ -120,7 +120,7 @@ def every_kind() -> GraspSet:
 
 def pool(monkeypatch: pytest.MonkeyPatch, engine: Stand, size: int) -> WorldPool:
     monkeypatch.setattr(screening, "mujoco_warp", lambda: engine)
-    return WorldPool(build(PADS, BOX, WHOLE, MujocoOptions()), "cpu", size)
+    return WorldPool(build_scene(PADS, BOX, WHOLE, MujocoOptions()), "cpu", size)
 
 
 @pytest.fixture(scope="module")
@@ -320,7 +320,7 @@ def test_clear_verdicts_on_500_grasps_are_the_certificates() -> None:
             hand, obj = hand_from_path(hand_name), object_from_path(object_name)
             grasps = synthesize(hand, obj, PlanRequest(count=GRASPS, fidelity=FIDELITIES["draft"], seed=77))
             held = validate(hand, obj, grasps).success == 1
-            found = WorldPool(build(hand, obj, decompose(obj), MujocoOptions()), "cpu", GRASPS).validate(grasps)
+            found = WorldPool(build_scene(hand, obj, decompose(obj), MujocoOptions()), "cpu", GRASPS).validate(grasps)
             assert not found.overflow.any()
             is_clear = found.clearly_held | found.clearly_failed
             clear += is_clear.tolist()

@@ -21,7 +21,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.rendering.hands import drawn_bodies
-from graspd.worker.viewing import Viewer, ViewerContent, _figures
+from graspd.worker.viewing import Viewer, ViewerContent, _metrics_text
 from tests.worker.commands_run import refused
 from tests.worker.models import attributes_of, object_from_mesh, quality_columns, two_finger_hand
 
@@ -116,7 +116,7 @@ def test_grasps_follow_one_another_each_in_its_own_scene(viewer) -> None:
 def test_what_grasp_lifts_and_whether_it_survives_shake_is_told() -> None:
     found = {"quality/payload_kg": np.array([np.nan, 0.8, 1.5]), "quality/shake_margin": np.array([np.nan, 0.2, 1.0])}
     shard = Shard("base", {}, {**arrays(2), **found})
-    plain, good, bad = (_figures(shard, row) for row in range(GRASPS))
+    plain, good, bad = (_metrics_text(shard, row) for row in range(GRASPS))
     assert "payload" not in plain and "shaken" not in plain
     assert "| payload | 0.80 kg |" in good and "| shaken | holds |" in good and "| shaken | fails |" in bad
 

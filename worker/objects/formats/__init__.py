@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from graspd.service.model.errors import GraspdError, MeshError
-from graspd.worker.objects.format_check import check_format, true_format
+from graspd.worker.objects.format_check import check_format, format_hint
 from graspd.worker.objects.formats import bare, dae, glb, obj
 from graspd.worker.objects.formats.obj import Nearby, no_files
 from graspd.worker.objects.formats.soup import MAX_FACES, Soup, check_soup
@@ -44,14 +44,14 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = no_files) -> Soup:
         raise MeshError(f"{filename}: meshes of type {suffix or '(none)'} are not read; convert to one of {known}")
     if not data:
         raise MeshError(f"{filename}: the file is empty; export the mesh again")
-    text = _marked_text(data)
+    text = _strip_byte_order_mark(data)
     check_format(filename, text, MeshError)
     try:
         # The check below finds invalid numbers, so NumPy's warnings are not needed.
         with np.errstate(all="ignore"):
             return check_soup(reader(text, nearby) if suffix in _WITH_LOOKS else reader(text))
     except GraspdError as error:
-        raise type(error)(f"{filename}: {true_format(filename, text) or error}") from None
+        raise type(error)(f"{filename}: {format_hint(filename, text) or error}") from None
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:
         # Readers rely on NumPy and json for malformed input: any of their errors is due to the file.
         kind = suffix[1:].upper()
@@ -60,7 +60,7 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = no_files) -> Soup:
         raise MeshError(f"{filename}: not a readable {kind} file: {what}; export the mesh again") from None
 
 
-def _marked_text(data: bytes) -> bytes:
+def _strip_byte_order_mark(data: bytes) -> bytes:
     """Return text data without its byte order mark, which editors write and formats exclude."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16", errors="replace").encode()

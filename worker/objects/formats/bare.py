@@ -42,7 +42,7 @@ def read_ply(data: bytes) -> Soup:
     line_end = next(ending for ending in (b"\r\n", b"\n", b"\r") if ending in data[:end])
     start = data.index(line_end, end) + len(line_end)
     order, elements = _header(data[:end].decode("ascii", "replace").splitlines()[1:])
-    body = _Ascii(data[start:]) if order is None else _Binary(data[start:], order)
+    body = _AsciiRows(data[start:]) if order is None else _BinaryRows(data[start:], order)
     vertices = np.zeros((0, 3))
     polygons = (np.zeros(0, np.int64), np.zeros(0, np.int64))
     of_vertices = of_faces = None
@@ -100,7 +100,7 @@ def _header(lines: list[str]) -> tuple[str | None, list[_Element]]:
 _Lists = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
-class _Ascii:
+class _AsciiRows:
     """Reads rows of text."""
 
     def __init__(self, body: bytes) -> None:
@@ -134,7 +134,7 @@ class _Ascii:
         return {n: np.array(values) for n, values in scalars.items()}, lists
 
 
-class _Binary:
+class _BinaryRows:
     """Reads rows of equal width at once, and other rows one by one."""
 
     def __init__(self, body: bytes, order: str) -> None:
@@ -143,12 +143,14 @@ class _Binary:
     def read(self, element: _Element) -> tuple[dict[str, np.ndarray], _Lists]:
         lists = [p for p in element.properties if p.count_type]
         if not lists:
-            table = self._take(np.dtype([(p.name, self._order + p.type) for p in element.properties]), element.count)
+            table = self._read_values(
+                np.dtype([(p.name, self._order + p.type) for p in element.properties]), element.count
+            )
             return {p.name: table[p.name] for p in element.properties}, {}
-        uniform = self._uniform(element) if len(lists) == 1 else None
+        uniform = self._read_uniform_rows(element) if len(lists) == 1 else None
         return uniform if uniform is not None else self._row_by_row(element)
 
-    def _uniform(self, element: _Element) -> tuple[dict[str, np.ndarray], _Lists] | None:
+    def _read_uniform_rows(self, element: _Element) -> tuple[dict[str, np.ndarray], _Lists] | None:
         """Read all rows at once if all lists are as long as the first, as in triangle meshes; else None."""
         first = self._at
         (name,) = self._row_by_row(_Element(element.name, min(element.count, 1), element.properties))[1].items()
@@ -176,16 +178,16 @@ class _Binary:
         for _ in range(element.count):
             for p in element.properties:
                 if p.count_type:
-                    count = int(self._take(np.dtype(self._order + p.count_type), 1)[0])
+                    count = int(self._read_values(np.dtype(self._order + p.count_type), 1)[0])
                     counts[p.name].append(count)
-                    items[p.name].append(self._take(np.dtype(self._order + p.type), count))
+                    items[p.name].append(self._read_values(np.dtype(self._order + p.type), count))
                 else:
-                    scalars[p.name].append(self._take(np.dtype(self._order + p.type), 1))
+                    scalars[p.name].append(self._read_values(np.dtype(self._order + p.type), 1))
         empty = [np.zeros(0, np.int64)]
         lists = {n: (np.array(counts[n], np.int64), np.concatenate(empty + items[n]).astype(np.int64)) for n in counts}
         return {n: np.concatenate(empty + values) for n, values in scalars.items()}, lists
 
-    def _take(self, dtype: np.dtype, count: int) -> np.ndarray:
+    def _read_values(self, dtype: np.dtype, count: int) -> np.ndarray:
         if count < 0 or dtype.itemsize * count > len(self._body) - self._at:
             raise MeshError("truncated: the header states more data than the file has")
         values = np.frombuffer(self._body, dtype, count=count, offset=self._at)
@@ -203,9 +205,9 @@ _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 def read_stl(data: bytes) -> Soup:
     declared, held = int.from_bytes(data[80:84], "little"), (len(data) - _HEADER) / _RECORD.itemsize
     if held == declared:
-        return _binary(data, declared)
+        return _read_binary_stl(data, declared)
     if b"\0" not in data[:1024] and (_FACET.search(data) or b"endsolid" in data[-1024:].lower()):
-        return _ascii(data)
+        return _read_ascii_stl(data)
     if len(data) < _HEADER:
         raise MeshError(f"{len(data)} bytes are too few for an STL file; it is truncated")
     if b"\0" not in data[:1024]:
@@ -213,15 +215,15 @@ def read_stl(data: bytes) -> Soup:
     if declared > held:
         raise MeshError(f"truncated: the header states {declared} faces, but the file has {int(held)}")
     # Some exporters append their own data; all faces stated in the header are present.
-    return _binary(data, declared)
+    return _read_binary_stl(data, declared)
 
 
-def _binary(data: bytes, count: int) -> Soup:
+def _read_binary_stl(data: bytes, count: int) -> Soup:
     check_face_count(count)
     return _soup(np.frombuffer(data, _RECORD, count=count, offset=_HEADER)["corners"].reshape(-1, 3).astype(float))
 
 
-def _ascii(data: bytes) -> Soup:
+def _read_ascii_stl(data: bytes) -> Soup:
     rows = _VERTEX.findall(data)
     check_face_count(len(rows) // 3)
     if len(rows) % 3:

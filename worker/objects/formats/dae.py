@@ -16,7 +16,7 @@ from defusedxml.common import DefusedXmlException
 
 from graspd.service.model.errors import MeshError
 from graspd.worker.objects.formats.obj import Nearby, colour_of, no_files
-from graspd.worker.objects.formats.soup import Soup, soup_of, triangulate, walk
+from graspd.worker.objects.formats.soup import Soup, join_parts, triangulate, walk_scene
 
 Element = ElementTree.Element
 #: Vertices (V, 3), triangles (F, 3) and material symbol of a primitive.
@@ -27,12 +27,12 @@ def read(data: bytes, nearby: Nearby = no_files) -> Soup:
     """Read vertices and triangles; every instance of a mesh in the node tree is its own copy."""
     root = _parse(data)
     library = _Library(root, nearby)
-    soup = soup_of(
+    soup = join_parts(
         (points, triangles, matrix, library.colour(bound.get(symbol, symbol)), ())
         for geometry, matrix, bound in _instances(root, library)
         for points, triangles, symbol in library.primitives(geometry)
     )
-    return replace(soup, vertices=soup.vertices * _unit(root))
+    return replace(soup, vertices=soup.vertices * _metres_per_unit(root))
 
 
 def _parse(data: bytes) -> Element:
@@ -51,7 +51,7 @@ def _parse(data: bytes) -> Element:
     return root
 
 
-def _unit(root: Element) -> float:
+def _metres_per_unit(root: Element) -> float:
     unit = root.find("asset/unit")
     metres = float(unit.get("meter", "1")) if unit is not None else 1.0
     if not 1e-9 < metres < 1e9:
@@ -68,7 +68,7 @@ class _Library:
         self._primitives: dict[str, list[_Primitive]] = {}
         self._colours: dict[str, np.ndarray] = {}
 
-    def named(self, reference: str | None) -> Element:
+    def find_element(self, reference: str | None) -> Element:
         found = self._known.get((reference or "").removeprefix("#"))
         if found is None:
             raise MeshError(f"it names {(reference or 'nothing')[:40]!r}, which is missing; export it as one file")
@@ -76,7 +76,7 @@ class _Library:
 
     def primitives(self, geometry: str) -> list[_Primitive]:
         if geometry not in self._primitives:
-            mesh = self.named(geometry).find("mesh")
+            mesh = self.find_element(geometry).find("mesh")
             self._primitives[geometry] = [] if mesh is None else list(self._read(mesh))
         return self._primitives[geometry]
 
@@ -91,17 +91,17 @@ class _Library:
                 source = primitive.find("input[@semantic='VERTEX']")
                 if source is None or not 0 < stride <= 64:
                     raise MeshError("a primitive has no vertices; export the mesh again")
-                positions = self.named(source.get("source")).find("input[@semantic='POSITION']")
-                points = self._points(positions.get("source") if positions is not None else None)
+                positions = self.find_element(source.get("source")).find("input[@semantic='POSITION']")
+                points = self._read_points(positions.get("source") if positions is not None else None)
                 counts, order = _polygons(primitive, kind, stride)
                 corners = order[int(source.get("offset", "0")) :: stride]
                 if int(counts.sum()) != len(corners) or (counts < 0).any():
                     raise MeshError("the stated number of a primitive's corners is wrong; export the mesh again")
                 yield points, triangulate(points, counts, corners), primitive.get("material", "")
 
-    def _points(self, reference: str | None) -> np.ndarray:
-        source = self.named(reference)
-        values, accessor = _numbers(source.find("float_array")), source.find("technique_common/accessor")
+    def _read_points(self, reference: str | None) -> np.ndarray:
+        source = self.find_element(reference)
+        values, accessor = _parse_numbers(source.find("float_array")), source.find("technique_common/accessor")
         facts = {} if accessor is None else accessor.attrib
         stride, start = int(facts.get("stride", "3")), int(facts.get("offset", "0"))
         if not 3 <= stride <= 64 or start < 0:
@@ -115,7 +115,7 @@ class _Library:
             self._colours[material] = self._diffuse(material)
         return self._colours[material]
 
-    def _picture(self, effect: Element, sampler: str) -> str:
+    def _texture_file(self, effect: Element, sampler: str) -> str:
         """Return the picture's file of a sampler: the sampler names a surface, and this names an image."""
         name = sampler
         for _ in range(2):
@@ -125,7 +125,7 @@ class _Library:
             source = next(param.iter("source"), None)
             source = next(param.iter("init_from"), None) if source is None else source
             name = (source.text or "").strip() if source is not None else name
-        found = next(self.named(name).iter("init_from"), None)
+        found = next(self.find_element(name).iter("init_from"), None)
         inner = found.find("ref") if found is not None else None
         file = found if inner is None else inner
         return (file.text or "").strip() if file is not None else ""
@@ -133,13 +133,13 @@ class _Library:
     def _diffuse(self, material: str) -> np.ndarray:
         unknown = np.full(3, np.nan)
         try:
-            instance = self.named(material).find("instance_effect")
-            effect = self.named(instance.get("url") if instance is not None else None)
+            instance = self.find_element(material).find("instance_effect")
+            effect = self.find_element(instance.get("url") if instance is not None else None)
             found = next(effect.iter("diffuse"), None)
             if found is not None and (texture := found.find("texture")) is not None:
-                picture = colour_of(self._picture(effect, texture.get("texture", "")), self._nearby)
+                picture = colour_of(self._texture_file(effect, texture.get("texture", "")), self._nearby)
                 return unknown if picture is None else picture
-            values = _numbers(found.find("color") if found is not None else None)
+            values = _parse_numbers(found.find("color") if found is not None else None)
         except (MeshError, ValueError):
             return unknown
         return np.clip(values[:3], 0, 1) if len(values) >= 3 and np.isfinite(values[:3]).all() else unknown
@@ -148,28 +148,30 @@ class _Library:
 def _polygons(primitive: Element, kind: str, stride: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the number of corners of each polygon, and the concatenated indices of all corners."""
     if kind == "polygons":
-        parts = [_numbers(part).astype(np.int64) for part in primitive.findall("p")]
+        parts = [_parse_numbers(part).astype(np.int64) for part in primitive.findall("p")]
         counts = np.array([len(part) // stride for part in parts], dtype=np.int64)
         return counts, np.concatenate(parts) if parts else np.zeros(0, np.int64)
-    order = _numbers(primitive.find("p")).astype(np.int64)
+    order = _parse_numbers(primitive.find("p")).astype(np.int64)
     if kind == "polylist":
-        return _numbers(primitive.find("vcount")).astype(np.int64), order
+        return _parse_numbers(primitive.find("vcount")).astype(np.int64), order
     return np.full(len(order) // (3 * stride), 3, dtype=np.int64), order
 
 
-def _numbers(element: Element | None) -> np.ndarray:
+def _parse_numbers(element: Element | None) -> np.ndarray:
     return np.array((element.text or "").split() if element is not None else [], dtype="S40").astype(float)
 
 
 def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarray, dict[str, str]]]:
     """Yield every mesh in the scene: geometry, 4x4 matrix, and material of each symbol."""
     shown = root.find("scene/instance_visual_scene")
-    scene = library.named(shown.get("url")) if shown is not None else root.find("library_visual_scenes/visual_scene")
+    scene = (
+        library.find_element(shown.get("url")) if shown is not None else root.find("library_visual_scenes/visual_scene")
+    )
 
-    def below(node: Element) -> list[Element]:
-        return node.findall("node") + [library.named(i.get("url")) for i in node.findall("instance_node")]
+    def child_nodes(node: Element) -> list[Element]:
+        return node.findall("node") + [library.find_element(i.get("url")) for i in node.findall("instance_node")]
 
-    for node, matrix in walk(scene.findall("node") if scene is not None else [], _matrix, below):
+    for node, matrix in walk_scene(scene.findall("node") if scene is not None else [], _node_transform, child_nodes):
         if node.find("instance_controller") is not None:
             raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without bones")
         for instance in node.findall("instance_geometry"):
@@ -180,20 +182,20 @@ def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarr
             yield instance.get("url", ""), matrix, bound
 
 
-def _matrix(node: Element) -> np.ndarray:
+def _node_transform(node: Element) -> np.ndarray:
     """Return the product of a node's transforms, in their order."""
     matrix = np.eye(4)
     for element in node:
         step = np.eye(4)
         match element.tag:
             case "matrix":
-                step = _numbers(element).reshape(4, 4)
+                step = _parse_numbers(element).reshape(4, 4)
             case "translate":
-                step[:3, 3] = _numbers(element).reshape(3)
+                step[:3, 3] = _parse_numbers(element).reshape(3)
             case "scale":
-                step[:3, :3] = np.diag(_numbers(element).reshape(3))
+                step[:3, :3] = np.diag(_parse_numbers(element).reshape(3))
             case "rotate":
-                step[:3, :3] = _rotation(*_numbers(element).reshape(4))
+                step[:3, :3] = _rotation(*_parse_numbers(element).reshape(4))
             case _:
                 continue
         matrix = matrix @ step

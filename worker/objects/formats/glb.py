@@ -15,7 +15,7 @@ import numpy as np
 from graspd.service.model.errors import MeshError
 from graspd.service.model.transforms import Floats, quat_to_matrix
 from graspd.worker.objects.formats.obj import UNREADABLE, mean_colour
-from graspd.worker.objects.formats.soup import Part, Soup, soup_of, walk
+from graspd.worker.objects.formats.soup import Part, Soup, join_parts, walk_scene
 
 _INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
 #: Positions are floats or, with KHR_mesh_quantization, integers that nodes or `normalized` scale.
@@ -30,24 +30,24 @@ _UNKNOWN: Final = np.full(3, np.nan)
 
 def read(data: bytes) -> Soup:
     """Read vertices and triangles; every instance of a mesh in the node tree is its own copy."""
-    document, binary = _chunks(data)
-    for name in map(str, _list(document, "extensionsRequired")):
+    document, binary = _read_chunks(data)
+    for name in map(str, _document_list(document, "extensionsRequired")):
         if not name.startswith(_HARMLESS):
-            raise _refusal(name)
-    return soup_of(_parts(document, binary))
+            raise _extension_error(name)
+    return join_parts(_read_parts(document, binary))
 
 
-def _parts(document: dict[str, Any], binary: bytes) -> Iterator[Part]:
+def _read_parts(document: dict[str, Any], binary: bytes) -> Iterator[Part]:
     looks: dict[tuple[int, int], np.ndarray] = {}
     for node, matrix in _instances(document):
         mesh = int(node["mesh"])
-        shown = _item(document, "meshes", mesh)
+        shown = _document_item(document, "meshes", mesh)
         _refuse_morphs(shown)
         for part, primitive in enumerate(shown["primitives"]):
             # Points and lines have no surface; CAD exporters add the edges of faces as lines.
             if 0 <= primitive.get("mode", _TRIANGLES) < _TRIANGLES:
                 continue
-            points, triangles = _primitive(document, binary, primitive)
+            points, triangles = _read_primitive(document, binary, primitive)
             if (mesh, part) not in looks:
                 looks[mesh, part] = material_colour(document, binary, primitive)
             yield points, triangles, matrix, looks[mesh, part], _names(document, node, shown, primitive)
@@ -62,7 +62,7 @@ def _names(document: dict[str, Any], node: dict[str, Any], mesh: dict[str, Any],
     return tuple(name for one in owners if isinstance(name := one.get("name"), str))
 
 
-def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+def _read_chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     if len(data) < 20 or data[:4] != b"glTF" or struct.unpack_from("<I", data, 4)[0] != 2:
         raise MeshError("not binary glTF of version 2")
     length, kind = struct.unpack_from("<II", data, 12)
@@ -81,18 +81,18 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _instances(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    nodes = _list(document, "nodes")
-    scenes = _list(document, "scenes")
+    nodes = _document_list(document, "nodes")
+    scenes = _document_list(document, "scenes")
     if scenes:
-        roots = _item(document, "scenes", document.get("scene", 0)).get("nodes", [])
+        roots = _document_item(document, "scenes", document.get("scene", 0)).get("nodes", [])
     else:
         below = {int(child) for node in nodes for child in node.get("children", [])}
         roots = [root for root in range(len(nodes)) if root not in below]
 
-    def named(indices: Iterable[Any]) -> Iterator[dict[str, Any]]:
-        return (_item(document, "nodes", index) for index in indices)
+    def nodes_of(indices: Iterable[Any]) -> Iterator[dict[str, Any]]:
+        return (_document_item(document, "nodes", index) for index in indices)
 
-    for node, matrix in walk(named(roots), _matrix, lambda node: named(node.get("children", []))):
+    for node, matrix in walk_scene(nodes_of(roots), _node_transform, lambda node: nodes_of(node.get("children", []))):
         _refuse_extensions(node)
         _refuse_morphs(node)
         if "skin" in node:
@@ -101,7 +101,7 @@ def _instances(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.nd
             yield node, matrix
 
 
-def _matrix(node: dict[str, Any]) -> np.ndarray:
+def _node_transform(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
         return np.array(node["matrix"], dtype=float).reshape(4, 4).T
     matrix = np.eye(4)
@@ -112,11 +112,13 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
     return matrix
 
 
-def _primitive(document: dict[str, Any], binary: bytes, primitive: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def _read_primitive(
+    document: dict[str, Any], binary: bytes, primitive: dict[str, Any]
+) -> tuple[np.ndarray, np.ndarray]:
     _refuse_extensions(primitive)
-    points = _accessor(document, binary, primitive["attributes"]["POSITION"], "VEC3")
+    points = _read_accessor(document, binary, primitive["attributes"]["POSITION"], "VEC3")
     if "indices" in primitive:
-        order = _accessor(document, binary, primitive["indices"], "SCALAR").astype(np.int64).reshape(-1)
+        order = _read_accessor(document, binary, primitive["indices"], "SCALAR").astype(np.int64).reshape(-1)
     else:
         order = np.arange(len(points), dtype=np.int64)
     match primitive.get("mode", _TRIANGLES):
@@ -136,15 +138,15 @@ def _primitive(document: dict[str, Any], binary: bytes, primitive: dict[str, Any
     return points.astype(float), order.reshape(-1, 3)
 
 
-def _accessor(document: dict[str, Any], binary: bytes, index: Any, shape: str) -> np.ndarray:
-    accessor = _item(document, "accessors", index)
+def _read_accessor(document: dict[str, Any], binary: bytes, index: Any, shape: str) -> np.ndarray:
+    accessor = _document_item(document, "accessors", index)
     if "sparse" in accessor or accessor.get("type") != shape or "bufferView" not in accessor:
         raise MeshError(f"an accessor is sparse, without data or not {shape}; export plain buffers")
     dtype = np.dtype((_POSITION_TYPES if shape == "VEC3" else _INDEX_TYPES)[accessor["componentType"]])
     width = 3 if shape == "VEC3" else 1
-    view = _item(document, "bufferViews", accessor["bufferView"])
+    view = _document_item(document, "bufferViews", accessor["bufferView"])
     _refuse_extensions(view)
-    if view.get("buffer", 0) != 0 or "uri" in (_list(document, "buffers") or [{}])[0]:
+    if view.get("buffer", 0) != 0 or "uri" in (_document_list(document, "buffers") or [{}])[0]:
         raise MeshError("the data lie in another file; export one GLB that holds everything")
     count, item = int(accessor["count"]), dtype.itemsize * width
     stride = int(view.get("byteStride", item))
@@ -165,7 +167,7 @@ def _refuse_extensions(part: dict[str, Any]) -> None:
     """Refuse extensions that replace the vertices; others that a file does not require are ignored."""
     for name in part.get("extensions", {}):
         if name.startswith(_GEOMETRY):
-            raise _refusal(name)
+            raise _extension_error(name)
 
 
 def _refuse_morphs(part: dict[str, Any]) -> None:
@@ -173,19 +175,19 @@ def _refuse_morphs(part: dict[str, Any]) -> None:
         raise MeshError("a mesh has morph targets with weights; apply its shape keys and export it without them")
 
 
-def _refusal(name: str) -> MeshError:
+def _extension_error(name: str) -> MeshError:
     how = "without compression" if "draco" in name or "meshopt" in name else "without it"
     return MeshError(f"the glTF extension {name[:60]} is not read; export {how}")
 
 
-def _item(document: dict[str, Any], key: str, index: Any) -> Any:
-    items = _list(document, key)
+def _document_item(document: dict[str, Any], key: str, index: Any) -> Any:
+    items = _document_list(document, key)
     if not 0 <= int(index) < len(items):
         raise MeshError(f"{key} has no item {int(index)}; export the mesh again")
     return items[int(index)]
 
 
-def _list(document: dict[str, Any], key: str) -> list[Any]:
+def _document_list(document: dict[str, Any], key: str) -> list[Any]:
     value = document.get(key, [])
     if not isinstance(value, list):
         raise MeshError(f"{key} is no list")
@@ -198,7 +200,9 @@ def material_colour(document: dict[str, Any], binary: bytes, primitive: dict[str
         material = document["materials"][int(primitive["material"])]["pbrMetallicRoughness"]
         factor = np.array(material.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0)), float)[:3].reshape(3)
         if "baseColorTexture" in material:
-            colour = _from_linear(_to_linear(_mean(document, binary, material["baseColorTexture"])) * factor)
+            colour = _from_linear(
+                _to_linear(_mean_texture_colour(document, binary, material["baseColorTexture"])) * factor
+            )
         elif "baseColorFactor" in material:
             colour = _from_linear(factor)
         else:
@@ -209,7 +213,7 @@ def material_colour(document: dict[str, Any], binary: bytes, primitive: dict[str
     return np.clip(colour, 0, 1) if np.isfinite(colour).all() else _UNKNOWN
 
 
-def _mean(document: dict[str, Any], binary: bytes, texture: dict[str, Any]) -> Floats:
+def _mean_texture_colour(document: dict[str, Any], binary: bytes, texture: dict[str, Any]) -> Floats:
     """Return the sRGB mean (3,) of an image in the file."""
     image = document["images"][int(document["textures"][int(texture["index"])]["source"])]
     view = document["bufferViews"][int(image["bufferView"])]

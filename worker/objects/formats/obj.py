@@ -12,7 +12,7 @@ import numpy as np
 
 from graspd.service.model.errors import MeshError
 from graspd.service.model.transforms import Floats
-from graspd.service.store.mesh_files import MAX_NAMES, reference_of
+from graspd.service.store.mesh_files import MAX_NAMES, parse_reference
 from graspd.worker.objects.formats.soup import FaceNames, Soup, check_face_count, triangulate
 
 _SHADES = 8
@@ -32,7 +32,7 @@ def read(data: bytes, nearby: Nearby = no_files) -> Soup:
     corners, counts = list[int](), list[int]()
     libraries, used = list[bytes](), list[tuple[int, bytes]]()
     named, names = list[tuple[int, tuple[str, ...]]](), dict[bytes, list[str]]()
-    for line in _lines(data):
+    for line in _logical_lines(data):
         if line.startswith(b"v "):
             numbers = line.split(None, 7)[1:7]
             vertices.append(numbers[:3])
@@ -41,7 +41,7 @@ def read(data: bytes, nearby: Nearby = no_files) -> Soup:
                 raise MeshError(f"vertex {len(vertices)} has fewer than three coordinates")
         elif line.startswith(b"f "):
             # OBJ counts from 1, backwards from the end for negative indices.
-            face = [_index(part.partition(b"/")[0], len(vertices)) for part in line.split()[1:]]
+            face = [_parse_index(part.partition(b"/")[0], len(vertices)) for part in line.split()[1:]]
             corners += face
             counts.append(len(face))
             if len(counts) % 65536 == 0:
@@ -98,14 +98,14 @@ def _face_colours(shades: list[list[bytes]], faces: np.ndarray) -> np.ndarray | 
     return np.where(np.isfinite(mean), np.clip(np.round(_SHADES * mean) / _SHADES, 0, 1), np.nan)
 
 
-def _index(text: bytes, count: int) -> int:
+def _parse_index(text: bytes, count: int) -> int:
     index = int(text)
     if index == 0 or abs(index) > 2**40:
         raise MeshError(f"a face has the index {index}; OBJ indices count from 1")
     return index - 1 if index > 0 else count + index
 
 
-def _lines(data: bytes) -> Iterable[bytes]:
+def _logical_lines(data: bytes) -> Iterable[bytes]:
     pending = b""
     for raw in data.splitlines():
         line = raw.strip()
@@ -138,12 +138,12 @@ def read_materials(data: bytes, nearby: Nearby) -> dict[bytes, Floats]:
         if key == b"newmtl" and len(found) < MAX_MATERIALS:
             name = rest.strip()
         elif key == b"Kd" and name is not None:
-            colour = _numbers(rest)
+            colour = _parse_colour(rest)
             if colour is not None:
                 found.setdefault(name, colour)
         elif key.lower() == b"map_kd" and name is not None and pictures < MAX_NAMES:
             pictures += 1
-            picture = colour_of(reference_of(rest), nearby)
+            picture = colour_of(parse_reference(rest), nearby)
             if picture is not None:
                 found[name] = picture
     return found
@@ -158,7 +158,7 @@ def colour_of(reference: str, nearby: Nearby) -> Floats | None:
         return None
 
 
-def _numbers(text: bytes) -> Floats | None:
+def _parse_colour(text: bytes) -> Floats | None:
     try:
         values = np.array(text.split()[:3], dtype="S40").astype(float)
     except ValueError:

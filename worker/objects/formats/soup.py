@@ -76,7 +76,7 @@ Node = TypeVar("Node")
 Part = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]
 
 
-def walk(
+def walk_scene(
     roots: Iterable[Node], matrix_of: Callable[[Node], Floats], below: Callable[[Node], Iterable[Node]]
 ) -> Iterator[tuple[Node, Floats]]:
     """Yield each node of a scene with its 4x4 matrix; a node that is named twice appears twice."""
@@ -92,7 +92,7 @@ def walk(
         stack += [(child, matrix, depth + 1) for child in below(node)]
 
 
-def soup_of(parts: Iterable[Part]) -> Soup:
+def join_parts(parts: Iterable[Part]) -> Soup:
     """Join the placed parts of a scene; mirrored ones are turned outward."""
     meshes: list[tuple[Floats, NDArray[np.int64]]] = []
     colours: list[Floats] = []
@@ -164,14 +164,14 @@ def triangulate(vertices: Floats, counts: Ints, corners: Ints) -> Ints:
         raise LimitError("its re-entrant polygons have too many corners; triangulate the mesh where it was made")
     for one in wrong:
         ring = corners[starts[one] : starts[one] + counts[one]]
-        inside = manifold3d.triangulate([_flat(vertices[ring], whole[one])])
+        inside = manifold3d.triangulate([_project_to_plane(vertices[ring], whole[one])])
         # Clipping of a self-intersecting polygon may return fewer triangles; such a polygon stays a fan.
         if len(inside) == number[one]:
             triangles[ends[one] - number[one] : ends[one]] = ring[inside]
     return triangles
 
 
-def _flat(points: Floats, normal: Floats) -> Floats:
+def _project_to_plane(points: Floats, normal: Floats) -> Floats:
     """Project points to (n, 2) as seen against `normal`, counter-clockwise."""
     axis = normal / np.linalg.norm(normal)
     across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])

@@ -32,10 +32,10 @@ from graspd.service.model.transforms import (
 )
 from graspd.worker.hands.flat_pinches import HEIGHTS_M, flat_pinches
 from graspd.worker.hands.grasp_widths import Size, largest_width, postures_between, postures_for_size
-from graspd.worker.hands.jaws import thinnest_fingertip
+from graspd.worker.hands.jaws import least_fingertip_width
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
+from graspd.worker.hands.pinch_postures import PinchPostures, pinch_postures_of
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
@@ -48,7 +48,7 @@ from graspd.worker.simulation.environment import CLEAR_M, Environment
 from graspd.worker.simulation.kernels import reaching as kernels
 from graspd.worker.simulation.launches import launch
 from graspd.worker.simulation.model import Model
-from graspd.worker.simulation.mounting import OUTERMOST, points_of
+from graspd.worker.simulation.mounting import OUTERMOST, mounting_points
 from graspd.worker.simulation.obstacles import MARGIN_M
 
 #: Least cosine between a pair's line and its normals. Such lines are inside the friction cones at half friction. Share
@@ -115,7 +115,7 @@ class Openings:
     pairs: Crossings
     sums: Floats
     """(P,) cumulative probability; empty if no pair fits."""
-    known: Oppositions
+    known: PinchPostures
     up: Floats
     """(3,) direction against gravity, object frame."""
     upright: bool
@@ -129,7 +129,7 @@ class Openings:
     @classmethod
     def of(
         cls,
-        known: Oppositions,
+        known: PinchPostures,
         obj: ObjectModel,
         scene: Environment,
         *,
@@ -165,9 +165,9 @@ class Openings:
     ) -> Openings:
         """Select pairs for fingertips that rest beside a flat object; if none fits, for the pads."""
         ends = flat_pinches(hand, float(np.ptp(obj.hull_vertices @ scene.up)))
-        tip = thinnest_fingertip(hand)
+        tip = least_fingertip_width(hand)
         flat = cls.of(ends, obj, scene, tip=tip, upright=True, wanted=wanted)
-        return flat if len(flat.sums) else cls.of(oppositions_of(hand), obj, scene, tip=tip, wanted=wanted)
+        return flat if len(flat.sums) else cls.of(pinch_postures_of(hand), obj, scene, tip=tip, wanted=wanted)
 
 
 def end_clearance(pairs: Crossings, scene: Environment, width: float) -> Floats:
@@ -186,7 +186,7 @@ def end_clearance(pairs: Crossings, scene: Environment, width: float) -> Floats:
 class AntipodalHands:
     """n hands with fingers on both sides of the object; rotations `turn`, retreat directions `away`."""
 
-    known: Oppositions
+    known: PinchPostures
     posture: NDArray[np.intp]
     """(n,) indices into `known`."""
     pivot: Floats
@@ -323,7 +323,7 @@ def posture_outlines(hand: HandModel, q: Floats) -> PostureOutlines:
             tips.append(np.full(DIRECTIONS, tip))
     mounting = np.zeros((0, 0, 3))
     if hand.mounting is not None:
-        mounting = points_of(hand.mounting)[:, :OUTERMOST] - hand.palm.centre
+        mounting = mounting_points(hand.mounting)[:, :OUTERMOST] - hand.palm.centre
     return PostureOutlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips), mounting)
 
 
@@ -334,7 +334,7 @@ EXACT_M: Final = 0.0005
 
 def narrow_reason(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment]) -> str | None:
     """Explain why fingertips of a hand cannot hold an object in any scene; None if no reason is found."""
-    known, pairs = oppositions_of(hand), crossings_of(obj)
+    known, pairs = pinch_postures_of(hand), crossings_of(obj)
     if not len(known) or not len(pairs):
         return None
     fits = pairs.width <= known.widest
@@ -349,7 +349,7 @@ def narrow_reason(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environmen
             f"{obj.name} is {1e3 * height:.0f} mm high: fingertips of {hand.name} that rest beside it face each "
             "other only at a larger height"
         )
-    thin = thinnest_fingertip(hand)
+    thin = least_fingertip_width(hand)
     gap = max(_widest_gap(pairs, fits, scene, thin) for scene in scenes)
     if gap >= thin + CLEAR_M:
         return None
@@ -421,7 +421,7 @@ class ReachSampling:
 
 def classify_size(hand: HandModel, width: Floats) -> Size | None:
     """Classify an object of pair widths (P,) as too small or too wide for the pads; None if neither."""
-    known = oppositions_of(hand)
+    known = pinch_postures_of(hand)
     if not len(known) or not len(width):
         return None
     if width.max() < min(SMALL_M, known.width[0]):
@@ -429,12 +429,12 @@ def classify_size(hand: HandModel, width: Floats) -> Size | None:
     return "wide" if width.min() + 2 * ROOM_M[0] > known.widest else None
 
 
-def _postures(hand: HandModel, width: Floats, size: Size | None) -> Oppositions:
+def _postures(hand: HandModel, width: Floats, size: Size | None) -> PinchPostures:
     """Return postures for pairs of these widths (P,); empty if no posture fits a pair."""
     if size == "wide" and width.min() + 2 * ROOM_M[0] > largest_width(hand):
-        return Oppositions.empty(hand)
-    known = oppositions_of(hand) if size is None else postures_for_size(hand, size)
-    return known if (width + 2 * ROOM_M[0] <= known.widest).any() else Oppositions.empty(hand)
+        return PinchPostures.empty(hand)
+    known = pinch_postures_of(hand) if size is None else postures_for_size(hand, size)
+    return known if (width + 2 * ROOM_M[0] <= known.widest).any() else PinchPostures.empty(hand)
 
 
 @cached_by_content(8)

@@ -20,7 +20,7 @@ from graspd.worker.planners.fast_graspd.schedule import WarmStart, fidelity_in_s
 from graspd.worker.planners.fast_graspd.starts import start_generator
 from graspd.worker.planners.port import BatchRequest
 from graspd.worker.planners.threads import StepCounter
-from graspd.worker.simulation.environment import PlacedGrasps, join_placed
+from graspd.worker.simulation.environment import PlacedGrasps, join_placed_grasps
 
 Rows = NDArray[np.intp]
 
@@ -61,7 +61,7 @@ class Batches:
         hands = known.starts * known.coarse_iterations + finalist_count(known) * known.fine_iterations
         self._steps = [StepCounter(one.wanted.count * (hands + 1), one.run) for one in asked]
         placed = [one.placed for one in wanted if one.placed is not None]
-        self.placed: PlacedGrasps | None = join_placed(placed) if placed else None
+        self.placed: PlacedGrasps | None = join_placed_grasps(placed) if placed else None
         self.ways: list[Floats] = []
         """Free directions of each scene."""
         for owner, scenes in enumerate(placed):

@@ -82,7 +82,7 @@ def _pair(
         coarse=PhaseGeometry(
             points=sample_surface(hand, fidelity.coarse_points),
             own=sample_surface(hand, COARSE_SELF_POINTS),
-            obj=whole.thinned(COARSE_SAMPLES),
+            obj=whole.with_fewer_samples(COARSE_SAMPLES),
         ),
         fine=PhaseGeometry(
             points=sample_surface(hand, fidelity.fine_points), own=sample_surface(hand, FINE_SELF_POINTS), obj=whole

@@ -111,7 +111,7 @@ class LaunchPart:
             np.concatenate([getattr(part, name) for part in (self, other)])
             for name in ("rows", "loss", "merit", "attempts")
         )
-        state = HandState.joined([self.state, other.state])
+        state = HandState.concatenate([self.state, other.state])
         return LaunchPart(rows, state, loss, merit, curve, join_grasp_sets(both) if both else None, attempts)
 
 
@@ -285,7 +285,7 @@ def _draw_all_starts(launch: _Launch, rows: Rows, run: ExecutionContext) -> _Sta
     )
     depth = np.concatenate([part.depth for part in parts])
     return _Starts(
-        np.concatenate([part.rows for part in parts]), HandState.joined([p.state for p in parts]), depth, touch
+        np.concatenate([part.rows for part in parts]), HandState.concatenate([p.state for p in parts]), depth, touch
     )
 
 
@@ -492,7 +492,7 @@ def grasps_of(
         grasps = join_grasp_sets(known)
     else:
         loss = np.concatenate([part.loss for part in parts])
-        state = HandState.joined([part.state for part in parts])
+        state = HandState.concatenate([part.state for part in parts])
         grasps = grasps_of_state(hand, obj, state, loss, placed, device=device)
     attempts = int(sum(part.attempts.sum() for part in parts))
     info = {"loss_curve": np.round(curve, 5).tolist(), "chunk": CHUNK}

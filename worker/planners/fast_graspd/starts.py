@@ -182,7 +182,7 @@ class Probe:
         It covers hand in object, object in links, links in links, and missing clearance from obstacles."""
         self.data.set_state(states)
         self._touching.run()
-        return self.data.deepest(len(states.pivot)).astype(float)
+        return self.data.deepest_penetration(len(states.pivot)).astype(float)
 
     def nearest(self, states: HandState) -> Floats:
         """Return each hand's least distance (n,) from the object [m], at most `LossOptions.band`."""

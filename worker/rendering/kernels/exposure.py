@@ -62,7 +62,7 @@ def expose(
         local = wp.normalize(wp.vec3f(x, y, 1.0))
         direction = wp.transform_vector(camera, local)
         if k == 0:
-            near = rays.may_hit(placed_in, world, eye, direction, spread)
+            near = rays.hit_mask(placed_in, world, eye, direction, spread)
         if flat:
             # Only the point where the ray meets the plane changes between passes.
             hit.distance = offset / wp.dot(hit.normal, direction)
@@ -79,7 +79,7 @@ def expose(
         toward = toward_in[world, k]
         point = eye + direction * hit.distance
         if k == 0 and near == rays.bit_of(hit.shape) and placed_in.shape[1] <= 64:
-            flat = rays.on_one_face(placed_in[world, hit.shape], hit, point, direction, spread)
+            flat = rays.is_on_one_face(placed_in[world, hit.shape], hit, point, direction, spread)
             offset = wp.dot(hit.normal, point - eye)
         cosine = wp.max(wp.dot(hit.normal, toward), 0.0)
         visible = wp.float32(0.0)

@@ -79,7 +79,7 @@ def box_distance(half: wp.vec3f, origin: wp.vec3f, direction: wp.vec3f):
 
 
 @wp.func
-def may_hit(
+def hit_mask(
     placed: wp.array2d[PlacedSolid], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f, spread: wp.float32
 ):
     """Return a mask with bit k set if a unit ray within `spread` of this one may hit solid k.
@@ -97,7 +97,7 @@ def may_hit(
 
 
 @wp.func
-def on_one_face(there: PlacedSolid, hit: RayHit, point: wp.vec3f, direction: wp.vec3f, spread: wp.float32):
+def is_on_one_face(there: PlacedSolid, hit: RayHit, point: wp.vec3f, direction: wp.vec3f, spread: wp.float32):
     """Check whether all rays within `spread` of this one hit the same plane, unless another solid is hit.
     The plane is the face of a box, away from its edges."""
     if there.mesh != wp.uint64(0):
@@ -120,7 +120,7 @@ def first_hit(
     origin: wp.vec3f,
     direction: wp.vec3f,
 ):
-    """Return the first hit of a ray among solids that it `may_hit`; meshes hit from inside are ignored."""
+    """Return the first hit of a ray among solids that it `hit_mask`; meshes hit from inside are ignored."""
     hit = RayHit()
     hit.shape = wp.int32(-1)
     hit.distance = FAR

@@ -75,7 +75,7 @@ def backdrop(light: Light, direction: wp.vec3f):
 
 
 @wp.func
-def surroundings(light: Light, direction: wp.vec3f, roughness: wp.float32):
+def environment_light(light: Light, direction: wp.vec3f, roughness: wp.float32):
     # A simple room: bright ceiling panel, dim floor, edge softened by the surface's roughness.
     soft = 0.12 + 0.6 * roughness
     room = mix(light.ground * 1.8, light.sky * 1.4, wp.smoothstep(-soft, soft, direction[2] - 0.05))
@@ -104,7 +104,7 @@ def radiance(
     diffuse = albedo * (1.0 - m.metalness)
     mirror = direction + n * (2.0 * -wp.dot(n, direction))
     colour = wp.cw_mul(diffuse, light.ground) * (0.5 - 0.5 * n[2])
-    colour += wp.cw_mul(fresnel, surroundings(light, mirror, m.roughness)) * (1.0 - 0.6 * m.roughness)
+    colour += wp.cw_mul(fresnel, environment_light(light, mirror, m.roughness)) * (1.0 - 0.6 * m.roughness)
     if arrived > 0.0:
         colour += wp.cw_mul(diffuse, light.sky) * (arrived * sky_weight)
         if lamp_weight > 0.0:

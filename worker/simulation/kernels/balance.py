@@ -26,7 +26,7 @@ class Workspace:
 
 
 @wp.func
-def slope(matrix: wp.array3d(dtype=wp.float64), b: int, k: int, r: wp.array2d(dtype=wp.float64)):
+def column_dot(matrix: wp.array3d(dtype=wp.float64), b: int, k: int, r: wp.array2d(dtype=wp.float64)):
     """Return the product of column k of system b and the vector r[b]."""
     total = wp.float64(0.0)
     for i in range(matrix.shape[2]):
@@ -35,7 +35,7 @@ def slope(matrix: wp.array3d(dtype=wp.float64), b: int, k: int, r: wp.array2d(dt
 
 
 @wp.func
-def change(matrix: wp.array3d(dtype=wp.float64), b: int, k: int, sign: wp.float64, work: Workspace):
+def update_normal_matrix(matrix: wp.array3d(dtype=wp.float64), b: int, k: int, sign: wp.float64, work: Workspace):
     """Add column k to the normal matrix, or remove it."""
     for i in range(matrix.shape[2]):
         for j in range(i + 1):
@@ -82,13 +82,13 @@ def objective(
     for i in range(target.shape[0]):
         total = total + square * r[b, i] * (wp.float64(0.5) * r[b, i] - target[i])
     for k in range(count):
-        above = wp.max(wp.float64(0.0), slope(matrix, b, k, r))
+        above = wp.max(wp.float64(0.0), column_dot(matrix, b, k, r))
         total = total + wp.float64(0.5) * above * above
     return total
 
 
 @wp.kernel
-def nonnegative(
+def solve_nonnegative(
     matrix_in: wp.array3d(dtype=wp.float64),
     target_in: wp.array(dtype=wp.float64),
     ridge_in: wp.float64,
@@ -120,10 +120,10 @@ def nonnegative(
             changed = wp.int32(0)
             for k in range(count):
                 above = wp.int32(0)
-                if slope(matrix_in, b, k, work.residual) > wp.float64(0.0):
+                if column_dot(matrix_in, b, k, work.residual) > wp.float64(0.0):
                     above = 1
                 if above != work.used[b, k]:
-                    change(matrix_in, b, k, wp.float64(2 * above - 1), work)
+                    update_normal_matrix(matrix_in, b, k, wp.float64(2 * above - 1), work)
                     work.used[b, k] = above
                     changed = 1
             if changed == 0 and whole == 1:
@@ -154,5 +154,5 @@ def nonnegative(
     for k in range(x_out.shape[1]):
         x_out[b, k] = wp.float64(0.0)
     for k in range(count):
-        x_out[b, k] = wp.max(wp.float64(0.0), slope(matrix_in, b, k, work.residual)) / square
+        x_out[b, k] = wp.max(wp.float64(0.0), column_dot(matrix_in, b, k, work.residual)) / square
     sound_out[b] = done

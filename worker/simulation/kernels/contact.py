@@ -41,7 +41,7 @@ class Physics:
 
 
 @wp.func
-def row(n: wp.vec3, p: wp.vec3):
+def jacobian_row(n: wp.vec3, p: wp.vec3):
     """Return (n, p x n): its product with the object's motion is the displacement of p along n."""
     t = wp.cross(p, n)
     return vec6(n[0], n[1], n[2], t[0], t[1], t[2])
@@ -178,7 +178,7 @@ def direct(
                 kw = k * wp.max(contacts_in.weight[b, i], 0.0)
                 tangent = u - wp.dot(n, u) * n
                 slide = wp.min(kw, kw * physics_in.friction * c / wp.max(wp.length(tangent), 1.0e-9))
-                j = row(n, p)
+                j = jacobian_row(n, p)
                 a += wp.outer((kw - slide) * j, j)
                 rhs -= (kw * (r - rho)) * j
                 c0 += slide
@@ -211,7 +211,7 @@ def direct_gradient(
         rho = contacts_inout.distance[b, i]
         n = contacts_inout.normal[b, i]
         p = contacts_inout.point[b, i]
-        j = row(n, p)
+        j = jacobian_row(n, p)
         kw = physics_in.stiffness * wp.max(contacts_inout.weight[b, i], 0.0)
         fade = physics_in.leak * wp.exp((r - rho) / physics_in.leak_length)
         total = float(0.0)
@@ -225,7 +225,7 @@ def direct_gradient(
                 tangent = u - wp.dot(n, u) * n
                 length = wp.length(tangent)
                 if physics_in.friction * c < length:
-                    g += physics_in.friction * wp.dot(row(tangent / length, p), y)
+                    g += physics_in.friction * wp.dot(jacobian_row(tangent / length, p), y)
             elif physics_in.one_sided == 1 and g < 0.0:
                 g = 0.0
             else:
@@ -266,7 +266,7 @@ def gauss_seidel(
         states_out[b, m, i] = s
         n = contacts_inout.normal[b, i]
         p = contacts_inout.point[b, i]
-        j = row(n, p)
+        j = jacobian_row(n, p)
         c = r - contacts_inout.distance[b, i] + wp.dot(j, s)
         if c > 0.0:
             impulse = c / inverse_mass_along(physics_in, j)
@@ -275,7 +275,7 @@ def gauss_seidel(
             tangent = u - wp.dot(n, u) * n
             length = wp.length(tangent)
             if length > 1.0e-9:
-                jt = row(tangent / length, p)
+                jt = jacobian_row(tangent / length, p)
                 stop = length / inverse_mass_along(physics_in, jt)
                 s = s - wp.min(stop, physics_in.friction * impulse) * (physics_in.inverse_mass * jt)
     loss_out[b, m] = displacement_loss(s, physics_in)
@@ -287,7 +287,7 @@ def gauss_seidel(
         before = states_out[b, m, i]
         n = contacts_inout.normal[b, i]
         p = contacts_inout.point[b, i]
-        j = row(n, p)
+        j = jacobian_row(n, p)
         mj = physics_in.inverse_mass * j
         w = wp.dot(j, mj)
         c = r - contacts_inout.distance[b, i] + wp.dot(j, before)
@@ -300,7 +300,7 @@ def gauss_seidel(
             slip = float(0.0)
             if length > 1.0e-9:
                 # The slip direction is taken as constant.
-                jt = row(tangent / length, p)
+                jt = jacobian_row(tangent / length, p)
                 mjt = physics_in.inverse_mass * jt
                 wt = wp.dot(jt, mjt)
                 along = wp.dot(mjt, y)
@@ -346,7 +346,7 @@ def jacobi(
         for i in range(count):
             n = contacts_inout.normal[b, i]
             p = contacts_inout.point[b, i]
-            j = row(n, p)
+            j = jacobian_row(n, p)
             c = r - contacts_inout.distance[b, i] + wp.dot(j, s)
             if c > 0.0:
                 touching += 1.0
@@ -357,7 +357,7 @@ def jacobi(
                 tangent = u - wp.dot(n, u) * n
                 length = wp.length(tangent)
                 if length > 1.0e-9:
-                    jt = row(tangent / length, p)
+                    jt = jacobian_row(tangent / length, p)
                     mjt = physics_in.inverse_mass * jt
                     total -= wp.min(length / wp.dot(jt, mjt), physics_in.friction * impulse) * mjt
         if touching > 0.0:
@@ -373,7 +373,7 @@ def jacobi(
             c = (
                 r
                 - contacts_inout.distance[b, i]
-                + wp.dot(row(contacts_inout.normal[b, i], contacts_inout.point[b, i]), before)
+                + wp.dot(jacobian_row(contacts_inout.normal[b, i], contacts_inout.point[b, i]), before)
             )
             if c > 0.0:
                 touching += 1.0
@@ -382,7 +382,7 @@ def jacobi(
         for i in range(count):
             n = contacts_inout.normal[b, i]
             p = contacts_inout.point[b, i]
-            j = row(n, p)
+            j = jacobian_row(n, p)
             mj = physics_in.inverse_mass * j
             w = wp.dot(j, mj)
             c = r - contacts_inout.distance[b, i] + wp.dot(j, before)
@@ -393,7 +393,7 @@ def jacobi(
                 tangent = u - wp.dot(n, u) * n
                 length = wp.length(tangent)
                 if length > 1.0e-9:
-                    jt = row(tangent / length, p)
+                    jt = jacobian_row(tangent / length, p)
                     mjt = physics_in.inverse_mass * jt
                     along = wp.dot(mjt, y)
                     wt = wp.dot(jt, mjt)

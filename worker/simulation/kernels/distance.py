@@ -181,7 +181,7 @@ class BodyPoints:
 
 
 @wp.func
-def placed_at(origin: wp.vec3d, place: wp.vec3d, turned: wp.quatd, point: wp.vec3d):
+def posed_point(origin: wp.vec3d, place: wp.vec3d, turned: wp.quatd, point: wp.vec3d):
     """Return a body's point [m] relative to `origin`, in single precision."""
     x = place + wp.quat_rotate(turned, point) - origin
     return wp.vec3(wp.float32(x[0]), wp.float32(x[1]), wp.float32(x[2]))
@@ -205,7 +205,7 @@ def body_gaps(
     place, turned = body_p_in[p, body], body_q_in[p, body]
     least = wp.min(gap_inout[p, body], reach_in)
     gap_inout[p, body] = least
-    middle = placed_at(origin_in, place, turned, points_in.middle[body])
+    middle = posed_point(origin_in, place, turned, points_in.middle[body])
     beyond = wp.max(skin_in.low - middle, middle - skin_in.high)
     outside = wp.length(wp.max(beyond, wp.vec3(0.0)))
     if outside > points_in.extent[body] and reach_in <= skin_in.coarse_reach:
@@ -215,7 +215,7 @@ def body_gaps(
         if coarse - way > reach_in + points_in.extent[body]:
             return
     for i in range(points_in.first[body], points_in.first[body + 1]):
-        x = placed_at(origin_in, place, turned, points_in.position[i])
+        x = posed_point(origin_in, place, turned, points_in.position[i])
         least = wp.min(least, nearest(skin_in, x, reach_in).distance)
     gap_inout[p, body] = least
 
@@ -234,6 +234,6 @@ def place_pieces(
     """Compute frames of the pieces from those of the bodies. Launch over (B, pieces)."""
     b, piece = wp.tid()
     body = pieces_in.body[piece]
-    piece_p_out[b, piece] = placed_at(origin_in, body_p_in[b, body], body_q_in[b, body], frame_p_in[piece])
+    piece_p_out[b, piece] = posed_point(origin_in, body_p_in[b, body], body_q_in[b, body], frame_p_in[piece])
     q = body_q_in[b, body] * frame_q_in[piece]
     piece_q_out[b, piece] = wp.quat(wp.float32(q[0]), wp.float32(q[1]), wp.float32(q[2]), wp.float32(q[3]))

@@ -40,7 +40,7 @@ class Hull:
 
 
 @wp.func
-def climb(hull: Hull, start: int, x: vec6):
+def find_visible_facet(hull: Hull, start: int, x: vec6):
     """Return a facet that x is above, or -1 if x is inside; the hull contains the origin.
     An ascent of n x / d from neighbour to neighbour ends at the largest value, as in the simplex method on the polar
     polytope."""
@@ -189,7 +189,7 @@ def insert(
 
 
 @wp.func
-def distance_of(hull: Hull, f: int, origin: vec6):
+def facet_distance(hull: Hull, f: int, origin: vec6):
     """Return the signed distance of facet f's plane from a point, positive inside."""
     normal = hull.normal[f]
     return (hull.offset[f] - wp.dot(normal, origin)) / wp.length(normal)
@@ -228,7 +228,7 @@ def grow_whole(
             p = 2 * (turn - half) + 1
         seen = wp.int32(-1)
         if failed == 0 and is_corner(corner, p) == 0:
-            seen = climb(hull, start, point[p])
+            seen = find_visible_facet(hull, start, point[p])
         if seen >= 0:
             top, spares, _born, failed = insert(hull, p, seen, point, mark, stamp + p, top, spares)
             start = hull.fresh[0]
@@ -236,7 +236,7 @@ def grow_whole(
     volume = wp.float64(0.0)
     for f in range(top):
         if hull.state[f] == LIVE:
-            least = wp.min(least, distance_of(hull, f, origin))
+            least = wp.min(least, facet_distance(hull, f, origin))
             volume = volume + hull.offset[f]
     return least, volume / wp.float64(720.0), failed
 
@@ -262,7 +262,7 @@ def grow_to_nearest(
     done = wp.int32(0)
     least = wp.float64(0.0)
     for f in range(7):
-        hull.distance[f] = distance_of(hull, f, origin)
+        hull.distance[f] = facet_distance(hull, f, origin)
     for turn in range(count):
         if failed == 0 and done == 0:
             nearest = wp.int32(-1)
@@ -284,7 +284,7 @@ def grow_to_nearest(
             else:
                 top, spares, born, failed = insert(hull, far, nearest, point, mark, stamp + turn, top, spares)
                 for n in range(born):
-                    hull.distance[hull.fresh[n]] = distance_of(hull, hull.fresh[n], origin)
+                    hull.distance[hull.fresh[n]] = facet_distance(hull, hull.fresh[n], origin)
     if done == 0:
         failed = 1
     return least, failed

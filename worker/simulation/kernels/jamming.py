@@ -3,7 +3,7 @@
 import warp as wp
 
 from graspd.worker.simulation.kernels.chain import Bodies, Chain, joint_value, place_body
-from graspd.worker.simulation.kernels.distance import BodyPoints, Skin, nearest, placed_at
+from graspd.worker.simulation.kernels.distance import BodyPoints, Skin, nearest, posed_point
 from graspd.worker.simulation.kernels.opening import Fingers, Hands
 from graspd.worker.simulation.kernels.pieces import Pieces, piece_distance
 from graspd.worker.simulation.kernels.touching import Points, point_of
@@ -57,7 +57,7 @@ def place_on_path(
 
 
 @wp.func
-def deepen(fingers: Fingers, depth: wp.array2d(dtype=wp.float32), b: wp.int32, body: wp.int32, deep: wp.float32):
+def record_depth(fingers: Fingers, depth: wp.array2d(dtype=wp.float32), b: wp.int32, body: wp.int32, deep: wp.float32):
     if fingers.of_body[body] >= 0:
         wp.atomic_max(depth, b, fingers.of_body[body], deep)
 
@@ -77,7 +77,7 @@ def finger_depth(
     if jams_inout.going[b] == 0 or points_in.first[body] == points_in.first[body + 1]:
         return
     place, turned = bodies_in.position[b, body], bodies_in.rotation[b, body]
-    middle = placed_at(wp.vec3d(), place, turned, points_in.middle[body])
+    middle = posed_point(wp.vec3d(), place, turned, points_in.middle[body])
     for piece in range(pieces_in.body.shape[0]):
         other = pieces_in.body[piece]
         if pieces_in.apart[body, other] == 1:
@@ -87,13 +87,13 @@ def finger_depth(
             if wp.length_sq(middle - centre) < about * about:
                 deepest = float(0.0)
                 for i in range(points_in.first[body], points_in.first[body + 1]):
-                    offset = placed_at(wp.vec3d(), place, turned, points_in.position[i]) - centre
+                    offset = posed_point(wp.vec3d(), place, turned, points_in.position[i]) - centre
                     if wp.dot(offset, offset) < bound * bound:
                         nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(piece_q_in[b, piece], offset))
                         deepest = wp.max(deepest, -nd[3])
                 if deepest > 0.0:
-                    deepen(fingers_in, jams_inout.depth, b, body, deepest)
-                    deepen(fingers_in, jams_inout.depth, b, other, deepest)
+                    record_depth(fingers_in, jams_inout.depth, b, body, deepest)
+                    record_depth(fingers_in, jams_inout.depth, b, other, deepest)
 
 
 @wp.kernel
@@ -121,7 +121,7 @@ def shorten_paths(less_in: wp.float64, jams_inout: FingerJams):
 
 
 @wp.kernel
-def take_path(fingers_in: Fingers, hands_in: Hands, jams_in: FingerJams, open_inout: wp.array2d(dtype=wp.float64)):
+def write_path(fingers_in: Fingers, hands_in: Hands, jams_in: FingerJams, open_inout: wp.array2d(dtype=wp.float64)):
     """Write the dofs at the ends of the shortened paths. Launch over (B, D)."""
     b, d = wp.tid()
     open_inout[b, d] = hands_in.q[b, d] + path_displacement(fingers_in, hands_in, jams_in, open_inout, b, d)
@@ -160,7 +160,7 @@ def hand_clearance(
 
 
 @wp.kernel
-def measure_retreat(wanted_in: wp.float32, step_in: wp.int32, retreat_inout: Retreat):
+def select_retreat(wanted_in: wp.float32, step_in: wp.int32, retreat_inout: Retreat):
     """Select the first sufficient retreat, or the one with the largest distance. Launch over B."""
     b = wp.tid()
     if retreat_inout.going[b] == 0:

@@ -54,7 +54,7 @@ class ClosestPoint:
 
 
 @wp.func
-def on_face(face: Face, p: wp.vec3):
+def closest_on_face(face: Face, p: wp.vec3):
     """Return weights v, w of a face's nearest point to p, and its feature (Ericson 2005, section 5.1.5)."""
     ab = face.ab
     ac = face.ac
@@ -100,7 +100,7 @@ def closest_in_cell(cells: Cells, cell: wp.int32, centre: wp.vec3, p: wp.vec3):
             break
         index = cells.face[k]
         face = cells.faces.face[index]
-        at = on_face(face, p)
+        at = closest_on_face(face, p)
         point = face.a + at[0] * face.ab + at[1] * face.ac
         offset = p - point
         square = wp.dot(offset, offset)
@@ -123,12 +123,12 @@ def closest_in_cell(cells: Cells, cell: wp.int32, centre: wp.vec3, p: wp.vec3):
 @wp.func
 def face_key(face: Face, centre: wp.vec3):
     """Return the distance of a face from a cell's centre."""
-    at = on_face(face, centre)
+    at = closest_on_face(face, centre)
     return wp.length(face.a + at[0] * face.ab + at[1] * face.ac - centre)
 
 
 @wp.func
-def cell_of(cell: wp.int32, shape: wp.vec3i):
+def cell_indices(cell: wp.int32, shape: wp.vec3i):
     """Return a cell's indices along the axes from its linear index."""
     return wp.vec3i(cell // (shape[1] * shape[2]), (cell // shape[2]) % shape[1], cell % shape[2])
 
@@ -152,7 +152,7 @@ def count_faces(
     """Count the faces to list for each cell with a corner within `within`; store their largest distance.
     Launch over the cells, in the order of their index."""
     cell = wp.tid()
-    place = cell_of(cell, wp.vec3i(field_in.shape[0] - 1, field_in.shape[1] - 1, field_in.shape[2] - 1))
+    place = cell_indices(cell, wp.vec3i(field_in.shape[0] - 1, field_in.shape[1] - 1, field_in.shape[2] - 1))
     least = float(1.0e3)
     low = float(1.0e3)
     high = float(-1.0e3)
@@ -198,7 +198,7 @@ def list_faces(
     start = first_in[cell]
     if first_in[cell + 1] == start:
         return
-    centre = cell_centre(cell_of(cell, shape_in), low_in, size_in)
+    centre = cell_centre(cell_indices(cell, shape_in), low_in, size_in)
     radius = radius_in[cell]
     extent = wp.vec3(radius, radius, radius)
     near = wp.mesh_query_aabb(mesh_in, centre - extent, centre + extent)

@@ -6,7 +6,7 @@ cylinders. Their distances from half-spaces are exact; for solids see `solids`."
 import warp as wp
 
 from graspd.worker.simulation.kernels.kinematics import Hands
-from graspd.worker.simulation.kernels.projection import Residuals, emit
+from graspd.worker.simulation.kernels.projection import Residuals, emit_residual
 from graspd.worker.simulation.kernels.wrenches import add_wrench
 
 wp.set_module_options({"enable_backward": False})
@@ -61,7 +61,7 @@ class Obstacles:
 
 
 @wp.func
-def posed(features: Features, hands: Hands, i: wp.int32, b: wp.int32):
+def posed_feature(features: Features, hands: Hands, i: wp.int32, b: wp.int32):
     """Return feature i of hand b in the frame of the hand's bodies."""
     out = Feature()
     out.body = features.body[i]
@@ -73,7 +73,7 @@ def posed(features: Features, hands: Hands, i: wp.int32, b: wp.int32):
 
 
 @wp.func
-def reach_of(f: Feature, n: wp.vec3):
+def feature_extent(f: Feature, n: wp.vec3):
     """Return the extent of a feature from its centre towards -n."""
     along = wp.dot(f.axis, n)
     if wp.dot(f.axis, f.axis) > 0.5:
@@ -102,7 +102,7 @@ def obstacle_distance(obstacles: Obstacles, k: wp.int32, f: Feature):
     for i in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
         plane = obstacles.planes[i]
         normal = wp.vec3(plane[0], plane[1], plane[2])
-        value = wp.dot(normal, f.centre) - plane[3] - reach_of(f, normal)
+        value = wp.dot(normal, f.centre) - plane[3] - feature_extent(f, normal)
         if value > d:
             d = value
             n = normal
@@ -155,7 +155,7 @@ def penalty(
     if not is_near(features_in, obstacles_in, hands, b, piece, 0.0, room_in):
         return
     for i in range(features_in.first[piece], features_in.first[piece + 1]):
-        f = posed(features_in, hands, i, b)
+        f = posed_feature(features_in, hands, i, b)
         weight = 2.0 * weight_in[hands.iteration[0]]
         for k in range(obstacles_in.first[hands.scene[b]], obstacles_in.first_solid[hands.scene[b]]):
             nd = obstacle_distance(obstacles_in, k, f)
@@ -185,11 +185,11 @@ def residuals(
     if not is_near(features_in, obstacles_in, hands, b, piece, near_in, 0.0):
         return
     for i in range(features_in.first[piece], features_in.first[piece + 1]):
-        f = posed(features_in, hands, i, b)
+        f = posed_feature(features_in, hands, i, b)
         for k in range(obstacles_in.first[hands.scene[b]], obstacles_in.first_solid[hands.scene[b]]):
             nd = obstacle_distance(obstacles_in, k, f)
             margin = required_clearance(features_in, obstacles_in, i, k, 0.0)
             if nd[3] < margin + near_in:
                 n = wp.vec3(nd[0], nd[1], nd[2])
                 gap = nd[3] - margin - target_in
-                emit(residuals_out, b, f.body, -1, lowest_point(f, n), n, gap, 1.0)
+                emit_residual(residuals_out, b, f.body, -1, lowest_point(f, n), n, gap, 1.0)

@@ -42,7 +42,7 @@ class Sweep:
 
 
 @wp.func
-def opened(
+def opened_dof(
     fingers: Fingers, hands: Hands, direction: wp.array2d(dtype=wp.float64), b: wp.int32, d: wp.int32, steps: wp.int32
 ):
     """Return a dof's value after `steps` steps, within limits that are widened to the grasp's own value."""
@@ -164,7 +164,7 @@ def place_opening(
     bodies_out.position[b, 0] = hands_in.position[b]
     bodies_out.rotation[b, 0] = hands_in.rotation[b]
     for body in range(1, chain_in.parent.shape[0]):
-        q = opened(fingers_in, hands_in, sweep_inout.direction, b, chain_in.dof[body], step_in[0])
+        q = opened_dof(fingers_in, hands_in, sweep_inout.direction, b, chain_in.dof[body], step_in[0])
         place_body(chain_in, bodies_out, b, body, joint_value(chain_in, body, q))
 
 
@@ -192,7 +192,7 @@ def finger_clearance(
 
 
 @wp.kernel
-def measure_opening(wanted_in: wp.float32, step_in: wp.array(dtype=wp.int32), sweep_inout: Sweep):
+def select_opening(wanted_in: wp.float32, step_in: wp.array(dtype=wp.int32), sweep_inout: Sweep):
     """Select each finger's first clear step, else the step with the largest distance.
     Stop hands with all fingers clear. Launch over B."""
     b = wp.tid()
@@ -210,7 +210,7 @@ def measure_opening(wanted_in: wp.float32, step_in: wp.array(dtype=wp.int32), sw
 
 
 @wp.kernel
-def take_opening(
+def write_opening(
     fingers_in: Fingers,
     hands_in: Hands,
     stuck_in: wp.float32,
@@ -227,6 +227,6 @@ def take_opening(
         return
     # `plain` is the restarted opening; its clearance is -1e9 for a hand that was not restarted.
     if plain_in.best[b, finger] > wp.min(first_in.best[b, finger], stuck_in):
-        open_out[b, d] = opened(fingers_in, hands_in, plain_in.direction, b, d, plain_in.chosen[b, finger])
+        open_out[b, d] = opened_dof(fingers_in, hands_in, plain_in.direction, b, d, plain_in.chosen[b, finger])
     else:
-        open_out[b, d] = opened(fingers_in, hands_in, first_in.direction, b, d, first_in.chosen[b, finger])
+        open_out[b, d] = opened_dof(fingers_in, hands_in, first_in.direction, b, d, first_in.chosen[b, finger])

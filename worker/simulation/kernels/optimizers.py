@@ -71,7 +71,7 @@ def advance(iteration_inout: wp.array(dtype=wp.int32)):
 
 
 @wp.kernel
-def converge(
+def stop_converged(
     loss_in: wp.array2d(dtype=wp.float32),
     depths_in: Depths,
     patience_in: wp.int32,

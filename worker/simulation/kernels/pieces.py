@@ -159,14 +159,14 @@ def cells_around(samples: Samples, p: wp.vec3, extent: wp.vec3):
 
 
 @wp.func
-def samples_of(samples: Samples, i: wp.int32, j: wp.int32, first: wp.int32, last: wp.int32):
+def sample_range(samples: Samples, i: wp.int32, j: wp.int32, first: wp.int32, last: wp.int32):
     """Return the first sample in a run of cells along z, and the first sample after the run."""
     row = (i * samples.shape[1] + j) * samples.shape[2]
     return wp.vec2i(samples.first[row + first], samples.first[row + last + 1])
 
 
 @wp.func
-def clip_depth(pieces: Pieces, piece: wp.int32, x: wp.vec3, above: wp.float32):
+def bounded_piece_distance(pieces: Pieces, piece: wp.int32, x: wp.vec3, above: wp.float32):
     """Return `piece_distance`; if it exceeds `above`, the result may be any distance that does."""
     if pieces.kind[piece] != HULL:
         return piece_distance(pieces, piece, x)
@@ -210,7 +210,7 @@ def object_in_pieces(
     cells = cells_around(samples_in, p, world_extent(turn, half))
     for i in range(cells[0], cells[1] + 1):
         for j in range(cells[2], cells[3] + 1):
-            mine = samples_of(samples_in, i, j, cells[4], cells[5])
+            mine = sample_range(samples_in, i, j, cells[4], cells[5])
             for index in range(mine[0], mine[1]):
                 x = samples_in.position[index]
                 offset = x - p
@@ -220,7 +220,7 @@ def object_in_pieces(
                     turn[0, 2] * offset[0] + turn[1, 2] * offset[1] + turn[2, 2] * offset[2],
                 )
                 if in_box(local, half):
-                    nd = clip_depth(pieces_in, piece, local, 0.0)
+                    nd = bounded_piece_distance(pieces_in, piece, local, 0.0)
                     depth = -nd[3]
                     if depth > 0.0:
                         n = turn * wp.vec3(nd[0], nd[1], nd[2])
@@ -301,7 +301,7 @@ def pieces_in_pieces(
             for i in range(points_in.first[own], points_in.first[own + 1]):
                 local = turn * points_in.position[i] + shift
                 if in_box(local, half):
-                    nd = clip_depth(pieces_in, piece, local, margin_in)
+                    nd = bounded_piece_distance(pieces_in, piece, local, margin_in)
                     depth = margin_in - nd[3]
                     if depth > 0.0:
                         f = (weight * depth) * wp.vec3(nd[0], nd[1], nd[2])

@@ -12,13 +12,13 @@ from graspd.worker.simulation.kernels.pieces import (
     BodyPoints,
     Pieces,
     Samples,
+    bounded_piece_distance,
     cells_around,
-    clip_depth,
     in_box,
     may_touch,
     piece_centre,
     piece_rotation,
-    samples_of,
+    sample_range,
     world_extent,
 )
 
@@ -42,7 +42,7 @@ class Residuals:
 
 
 @wp.func
-def emit(
+def emit_residual(
     out: Residuals,
     b: wp.int32,
     body: wp.int32,
@@ -83,10 +83,10 @@ def point_residuals(
     for i in range(part * lane_in, wp.min((part + 1) * lane_in, c.count[b])):
         rho = c.distance[b, i]
         if rho < near_in:
-            emit(residuals_out, b, c.body[b, i], -1, c.point[b, i], c.normal[b, i], rho - target_in, 1.0)
+            emit_residual(residuals_out, b, c.body[b, i], -1, c.point[b, i], c.normal[b, i], rho - target_in, 1.0)
         elif rho < hold_in and c.weight[b, i] > 0.0:
             gap = rho - hold_target_in
-            emit(residuals_out, b, c.body[b, i], -1, c.point[b, i], c.normal[b, i], gap, hold_weight_in)
+            emit_residual(residuals_out, b, c.body[b, i], -1, c.point[b, i], c.normal[b, i], gap, hold_weight_in)
 
 
 @wp.kernel
@@ -111,16 +111,16 @@ def sample_residuals(
     cells = cells_around(samples_in, p, world_extent(turn, half))
     for i in range(cells[0], cells[1] + 1):
         for j in range(cells[2], cells[3] + 1):
-            mine = samples_of(samples_in, i, j, cells[4], cells[5])
+            mine = sample_range(samples_in, i, j, cells[4], cells[5])
             for index in range(mine[0], mine[1]):
                 x = samples_in.position[index]
                 local = back * (x - p)
                 if in_box(local, half):
-                    nd = clip_depth(pieces_in, piece, local, near_in)
+                    nd = bounded_piece_distance(pieces_in, piece, local, near_in)
                     if nd[3] < near_in:
                         n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
                         # The link's motion along its own outward normal reduces d.
-                        emit(residuals_out, b, body, -1, x, -n, nd[3] - target_in, 1.0)
+                        emit_residual(residuals_out, b, body, -1, x, -n, nd[3] - target_in, 1.0)
 
 
 @wp.kernel
@@ -149,11 +149,11 @@ def self_residuals(
             for i in range(points_in.first[own], points_in.first[own + 1]):
                 local = turn * points_in.position[i] + shift
                 if in_box(local, half):
-                    nd = clip_depth(pieces_in, piece, local, near_in)
+                    nd = bounded_piece_distance(pieces_in, piece, local, near_in)
                     if nd[3] < near_in:
                         x = p + wp.quat_rotate(q, local)
                         n = wp.quat_rotate(q, wp.vec3(nd[0], nd[1], nd[2]))
-                        emit(residuals_out, b, own, other, x, n, nd[3] - target_in, 1.0)
+                        emit_residual(residuals_out, b, own, other, x, n, nd[3] - target_in, 1.0)
 
 
 @wp.func
@@ -181,7 +181,7 @@ def add_chain(
 
 
 @wp.func
-def fixed(x: wp.float32):
+def to_fixed_point(x: wp.float32):
     """Return x as an integer: sums of integers are the same in any order."""
     return wp.int64(x * FIXED)
 
@@ -196,7 +196,7 @@ def normal_equations(
     matrix_inout: wp.array3d(dtype=wp.int64),
     vector_inout: wp.array2d(dtype=wp.int64),
 ):
-    """Add to J'WJ (B, n, n), lower half, and J'We (B, n), n = 6 + D, both `fixed`.
+    """Add to J'WJ (B, n, n), lower half, and J'We (B, n), n = 6 + D, both `to_fixed_point`.
     Launch over (B, R / lane); `row` has a scratch row per thread."""
     b, part = wp.tid()
     count = wp.min(residuals_in.count[b], residuals_in.body.shape[1])
@@ -225,11 +225,11 @@ def normal_equations(
         for i in range(n):
             ri = row_out[own, i]
             if ri != 0.0:
-                wp.atomic_add(vector_inout, b, i, fixed(w * ri * e))
+                wp.atomic_add(vector_inout, b, i, to_fixed_point(w * ri * e))
                 for j in range(i + 1):
                     rj = row_out[own, j]
                     if rj != 0.0:
-                        wp.atomic_add(matrix_inout, b, i, j, fixed(w * ri * rj))
+                        wp.atomic_add(matrix_inout, b, i, j, to_fixed_point(w * ri * rj))
 
 
 @wp.struct

@@ -60,7 +60,7 @@ def first_above(sorted_in: wp.array(dtype=wp.float32), value: wp.float32):
 
 
 @wp.func
-def clear_of(surface: Surface, grips: Grips, posture: wp.int32, pivot: wp.vec3, rotation: wp.quat):
+def is_clear(surface: Surface, grips: Grips, posture: wp.int32, pivot: wp.vec3, rotation: wp.quat):
     """Check that no ball of a posed hand is closer to the surface than its radius."""
     for s in range(grips.balls.shape[1]):
         place = pivot + wp.quat_rotate(rotation, grips.balls[posture, s])
@@ -80,7 +80,7 @@ def into_cone(direction: wp.vec3, axis: wp.vec3, cosine: wp.float32):
 
 
 @wp.func
-def drawn(
+def draw_hand(
     surface: Surface,
     grips: Grips,
     alike: wp.vec2,
@@ -123,7 +123,7 @@ def drawn(
     pivot = grips.middle[pair] - wp.quat_rotate(out.rotation, reach) - ahead * away
     for r in range(retreats.shape[0]):
         out.pivot = pivot + retreats[r] * away
-        if clear_of(surface, grips, out.posture, out.pivot, out.rotation):
+        if is_clear(surface, grips, out.posture, out.pivot, out.rotation):
             out.found = True
             return out
     return out
@@ -150,7 +150,7 @@ def reach(
     number_out[b] = -1
     for k in range(first_in[b], draws_in):
         state = wp.rand_init(seed_in[b], k)
-        found = drawn(surface_in, grips_in, alike_in, room_in, retreat_in, state)
+        found = draw_hand(surface_in, grips_in, alike_in, room_in, retreat_in, state)
         if found.found:
             number_out[b] = k
             pivot_out[b] = found.pivot

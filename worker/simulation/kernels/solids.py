@@ -14,11 +14,11 @@ from graspd.worker.simulation.kernels.obstacles import (
     Obstacles,
     lowest_point,
     obstacle_distance,
-    posed,
+    posed_feature,
     required_clearance,
 )
 from graspd.worker.simulation.kernels.pieces import Pieces, piece_centre, piece_distance, piece_rotation
-from graspd.worker.simulation.kernels.projection import Residuals, emit
+from graspd.worker.simulation.kernels.projection import Residuals, emit_residual
 from graspd.worker.simulation.kernels.wrenches import add_wrench
 
 wp.set_module_options({"enable_backward": False})
@@ -64,7 +64,7 @@ def edge_gradient(n0: wp.vec3, g0: wp.float32, n1: wp.vec3, g1: wp.float32):
 
 
 @wp.func
-def plane_over(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
+def farthest_plane(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
     """Return (normal, value) of the plane of obstacle k with the largest signed distance of x."""
     out = wp.vec4(0.0, 0.0, 0.0, -1.0e9)
     for i in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
@@ -80,7 +80,7 @@ def convex_distance(pieces: Pieces, piece: wp.int32, obstacles: Obstacles, k: wp
     """Return (gradient, signed distance) at x of a piece, in its frame; of obstacle k if `piece` is -1."""
     if piece >= 0:
         return piece_distance(pieces, piece, x)
-    return plane_over(obstacles, k, x)
+    return farthest_plane(obstacles, k, x)
 
 
 @wp.func
@@ -136,7 +136,7 @@ def least_on_edge(
 
 
 @wp.func
-def over_face(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
+def is_in_obstacle(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
     """Check whether x lies on obstacle k, or in it."""
     for i in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
         plane = obstacles.planes[i]
@@ -146,7 +146,7 @@ def over_face(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
 
 
 @wp.func
-def apart(pieces: Pieces, obstacles: Obstacles, hands: Hands, b: int, piece: int, k: int, reach: float):
+def is_apart(pieces: Pieces, obstacles: Obstacles, hands: Hands, b: int, piece: int, k: int, reach: float):
     """Check whether the bounding spheres of a piece and an obstacle are farther than `reach` apart."""
     offset = piece_centre(pieces, piece, b, hands.body_p, hands.body_q) - obstacles.centre[k]
     r = obstacles.radius[k] + wp.length(pieces.half[piece]) + wp.max(reach, 0.0)
@@ -213,10 +213,10 @@ def penalty(
     weight = 2.0 * weight_in[hands.iteration[0]]
     for k in range(obstacles_in.first_solid[hands.scene[b]], obstacles_in.first[hands.scene[b] + 1]):
         keep = required_clearance(features_in, obstacles_in, first, k, room_in)
-        if apart(pieces_in, obstacles_in, hands, b, piece, k, keep):
+        if is_apart(pieces_in, obstacles_in, hands, b, piece, k, keep):
             continue
         for i in range(first, features_in.first[piece + 1]):
-            f = posed(features_in, hands, i, b)
+            f = posed_feature(features_in, hands, i, b)
             nd = obstacle_distance(obstacles_in, k, f)
             short = nd[3] - keep
             if short < 0.0:
@@ -253,17 +253,17 @@ def residuals(
         margin = required_clearance(features_in, obstacles_in, first, k, 0.0)
         keep = margin + near_in
         target = margin + target_in
-        if apart(pieces_in, obstacles_in, hands, b, piece, k, keep):
+        if is_apart(pieces_in, obstacles_in, hands, b, piece, k, keep):
             continue
         for i in range(first, features_in.first[piece + 1]):
-            f = posed(features_in, hands, i, b)
+            f = posed_feature(features_in, hands, i, b)
             nd = obstacle_distance(obstacles_in, k, f)
             if nd[3] < keep:
                 n = wp.vec3(nd[0], nd[1], nd[2])
-                emit(residuals_out, b, body, -1, lowest_point(f, n), n, nd[3] - target, 1.0)
+                emit_residual(residuals_out, b, body, -1, lowest_point(f, n), n, nd[3] - target, 1.0)
         near = nearest_edge(features_in, pieces_in, obstacles_in, hands, b, piece, k, keep)
         if near.distance < keep:
-            emit(residuals_out, b, body, -1, near.point, near.direction, near.distance - target, 1.0)
+            emit_residual(residuals_out, b, body, -1, near.point, near.direction, near.distance - target, 1.0)
 
 
 @wp.kernel
@@ -281,14 +281,14 @@ def distances(
     body = pieces_in.body[piece]
     least = reach_in
     for k in range(obstacles_in.first_solid[0], obstacles_in.first[1]):
-        if apart(pieces_in, obstacles_in, hands_in, b, piece, k, least):
+        if is_apart(pieces_in, obstacles_in, hands_in, b, piece, k, least):
             continue
         for i in range(features_in.first[piece], features_in.first[piece + 1]):
-            f = posed(features_in, hands_in, i, b)
+            f = posed_feature(features_in, hands_in, i, b)
             nd = obstacle_distance(obstacles_in, k, f)
             if nd[3] < least:
                 n = wp.vec3(nd[0], nd[1], nd[2])
-                if over_face(obstacles_in, k, lowest_point(f, n) - nd[3] * n):
+                if is_in_obstacle(obstacles_in, k, lowest_point(f, n) - nd[3] * n):
                     least = nd[3]
         near = nearest_edge(features_in, pieces_in, obstacles_in, hands_in, b, piece, k, least)
         least = wp.min(least, near.distance)

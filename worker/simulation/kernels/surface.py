@@ -51,7 +51,7 @@ class SurfaceSample:
 
 
 @wp.func
-def smoothed(
+def smoothed_distance(
     surface: Surface, point: wp.vec3, closest: wp.vec3, face: wp.int32, u: wp.float32, v: wp.float32, sign: wp.float32
 ):
     """Return distance and normal at a point whose closest point has weights u, v, 1 - u - v of a face."""
@@ -93,7 +93,7 @@ def mesh_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
     query = wp.mesh_query_point_sign_normal(surface.mesh, point, reach)
     if query.result:
         closest = wp.mesh_eval_position(surface.mesh, query.face, query.u, query.v)
-        out = smoothed(surface, point, closest, query.face, query.u, query.v, query.sign)
+        out = smoothed_distance(surface, point, closest, query.face, query.u, query.v, query.sign)
     return out
 
 
@@ -119,7 +119,9 @@ def near_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
         centre = surface.field_origin + surface.field_cell * wp.vec3(float(i) + 0.5, float(j) + 0.5, float(k) + 0.5)
         found = closest_in_cell(surface.cells, (i * ny + j) * nz + k, centre, point)
         if found.face >= 0:
-            out = smoothed(surface, point, found.point, found.face, 1.0 - found.v - found.w, found.v, found.sign)
+            out = smoothed_distance(
+                surface, point, found.point, found.face, 1.0 - found.v - found.w, found.v, found.sign
+            )
             if found.gap >= reach:
                 out.distance = reach
                 out.normal = wp.vec3(0.0)

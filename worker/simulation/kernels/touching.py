@@ -42,7 +42,7 @@ def point_of(points: Points, bodies: Bodies, b: wp.int32, i: wp.int32):
 
 
 @wp.kernel
-def touch(
+def find_nearby_surface(
     skin_in: Skin,
     points_in: Points,
     lane_in: wp.int32,
@@ -62,7 +62,7 @@ def touch(
 
 
 @wp.func
-def apart(touching: NearbySurface, radius: wp.float64, b: wp.int32, i: wp.int32, j: wp.int32):
+def squared_separation(touching: NearbySurface, radius: wp.float64, b: wp.int32, i: wp.int32, j: wp.int32):
     """Return the squared separation of two contacts: that of places / `radius`, plus that of normals."""
     place = (wp.vec3d(touching.closest[b, i]) - wp.vec3d(touching.closest[b, j])) / radius
     turn = wp.vec3d(touching.normal[b, i]) - wp.vec3d(touching.normal[b, j])
@@ -70,7 +70,7 @@ def apart(touching: NearbySurface, radius: wp.float64, b: wp.int32, i: wp.int32,
 
 
 @wp.kernel
-def choose(
+def choose_contacts(
     points_in: Points,
     finger_in: wp.array(dtype=wp.int32),
     touching_in: NearbySurface,
@@ -136,7 +136,9 @@ def choose(
         farthest = wp.float64(-2.0)
         for k in range(n):
             if least_out[b, k] >= wp.float64(0.0):
-                least_out[b, k] = wp.min(least_out[b, k], apart(touching_in, radius_in, b, list_out[b, k], last))
+                least_out[b, k] = wp.min(
+                    least_out[b, k], squared_separation(touching_in, radius_in, b, list_out[b, k], last)
+                )
             if least_out[b, k] > farthest:
                 farthest = least_out[b, k]
                 best = k
@@ -155,7 +157,7 @@ def first_tangent(n: wp.vec3d):
 
 
 @wp.kernel
-def columns(
+def balance_columns(
     chain_in: Chain,
     effort_in: wp.array(dtype=wp.float64),
     points_in: Points,

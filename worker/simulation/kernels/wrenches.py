@@ -15,7 +15,7 @@ Wrenches = wp.array3d(dtype=wp.int64)  # (B, L, 6)
 
 
 @wp.func
-def counts(x: wp.float32):
+def to_counts(x: wp.float32):
     """Return a component in counts of `UNIT`, at most `MOST` in size; 0 if it is not finite."""
     if not wp.isfinite(x):
         return wp.int64(0)
@@ -25,8 +25,8 @@ def counts(x: wp.float32):
 @wp.func
 def add_wrench(wrench: Wrenches, b: wp.int32, body: wp.int32, force: wp.vec3, torque: wp.vec3):
     for i in range(3):
-        wp.atomic_add(wrench, b, body, i, counts(force[i]))
-        wp.atomic_add(wrench, b, body, 3 + i, counts(torque[i]))
+        wp.atomic_add(wrench, b, body, i, to_counts(force[i]))
+        wp.atomic_add(wrench, b, body, 3 + i, to_counts(torque[i]))
 
 
 @wp.func

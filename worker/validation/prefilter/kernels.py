@@ -105,7 +105,7 @@ class TestConstants:
 
 
 @wp.func
-def blend(a: wp.vec4, b: wp.vec4, share: wp.float32):
+def slerp(a: wp.vec4, b: wp.vec4, share: wp.float32):
     """Interpolate unit quaternions a and b at `share`, by slerp along the shorter arc."""
     cosine = wp.dot(a, b)
     if cosine < 0.0:
@@ -124,7 +124,7 @@ def command(w: wp.int32, g: wp.int32, ticks: wp.int32, grasps: GraspCommands, en
     stage = wp.min(ticks / STAGE, 2 * STAGES - 1)
     part = stage / STAGES
     share = float(stage % STAGES + 1) / float(STAGES)
-    q = blend(grasps.turn[g, part], grasps.turn[g, part + 1], share)
+    q = slerp(grasps.turn[g, part], grasps.turn[g, part + 1], share)
     engine.mocap_pos[w, 0] = (1.0 - share) * grasps.position[g, part] + share * grasps.position[g, part + 1]
     engine.mocap_quat[w, 0] = wp.quat(q[0], q[1], q[2], q[3])
     for k in range(engine.ctrl.shape[1]):
@@ -141,7 +141,7 @@ def offset(w: wp.int32, terms: TestConstants, engine: Engine):
 
 
 @wp.func
-def turned(w: wp.int32, terms: TestConstants, engine: Engine):
+def rotation_angle(w: wp.int32, terms: TestConstants, engine: Engine):
     """Return the rotation of the object since the start [rad]."""
     at = terms.object_qpos + 3
     axis = wp.vec3(engine.qpos[w, at + 1], engine.qpos[w, at + 2], engine.qpos[w, at + 3])
@@ -226,7 +226,7 @@ def check_state(
         return
     worlds_out.ticks[w] = worlds_out.ticks[w] + 1
     now = offset(w, terms_in, engine_out)
-    angle = turned(w, terms_in, engine_out)
+    angle = rotation_angle(w, terms_in, engine_out)
     moved = wp.length(now)
     excess = wp.max(moved / MOVED, angle / TURNED)
     number = worlds_out.push[w]
@@ -284,7 +284,7 @@ def check_state(
 
 
 @wp.kernel
-def place(first_in: wp.int32, states_in: wp.array2d(dtype=wp.float32), engine_out: Engine):
+def set_states(first_in: wp.int32, states_in: wp.array2d(dtype=wp.float32), engine_out: Engine):
     """Set the states from row `first_in` on, at rest."""
     w = wp.tid()
     row = wp.min(first_in + w, states_in.shape[0] - 1)
@@ -295,7 +295,7 @@ def place(first_in: wp.int32, states_in: wp.array2d(dtype=wp.float32), engine_ou
 
 
 @wp.kernel
-def depths(
+def measure_depths(
     first_in: wp.int32,
     of_hand_in: wp.array(dtype=wp.int32),
     contacts_in: wp.array(dtype=wp.int32),

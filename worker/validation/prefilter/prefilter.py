@@ -75,7 +75,7 @@ class PrefilterOutcomes:
         lost = np.isin(self.outcome, kinds).any(axis=1) & np.isfinite(self.margin) & (self.margin > BAND[1])
         return np.asarray((inside | lost) & ~self.overflow)
 
-    def put(self, rows: NDArray[np.intp], again: Self) -> Self:
+    def replace_rows(self, rows: NDArray[np.intp], again: Self) -> Self:
         changed: dict[str, Any] = {}
         for field in fields(self):
             changed[field.name] = getattr(self, field.name).copy()
@@ -111,7 +111,7 @@ class WorldPool:
                 self._doublings += 1
                 log.info("%d of %d grasps need more memory for contacts; it is doubled", len(lost), len(grasps))
                 self._allocate()
-                found = found.put(lost, self._validate(grasps.take(lost), run.without_progress()))
+                found = found.replace_rows(lost, self._validate(grasps.take(lost), run.without_progress()))
                 lost = np.flatnonzero(found.overflow)
         return found
 
@@ -199,11 +199,11 @@ class WorldPool:
         n, data = len(states), self._data
         out, rows, short = wp.zeros((n, 2), dtype=wp.float32), wp.array(states, dtype=wp.float32), np.zeros(n, bool)
         for first in range(0, n, self.worlds):
-            wp.launch(kernels.place, self.worlds, inputs=[first, rows], outputs=[self._arrays])
+            wp.launch(kernels.set_states, self.worlds, inputs=[first, rows], outputs=[self._arrays])
             self._engine.fwd_position(self._model, data)
             contact = data.contact
             inputs = [first, self._of_hand, data.nacon, contact.worldid, contact.geom, contact.dist]
-            wp.launch(kernels.depths, data.naconmax, inputs=inputs, outputs=[out])
+            wp.launch(kernels.measure_depths, data.naconmax, inputs=inputs, outputs=[out])
             most = max(int(data.nacon.numpy()[0]), int(data.ncollision.numpy()[0]))
             short[first : first + self.worlds] = most > data.naconmax
         return out.numpy().astype(float), short

@@ -5,7 +5,14 @@ from typing import Any
 import pytest
 
 from graspd.service.index.queries.overview import BatchCost
-from graspd.service.index.queries.rates import ORIGIN, STORED, STORED_METHODS, STORED_MODEL_S, STORED_PLACE, machine_of
+from graspd.service.index.queries.rates import (
+    ORIGIN,
+    STORED,
+    STORED_METHODS,
+    STORED_MODEL_S,
+    STORED_PLACE,
+    measure_machine,
+)
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import NotFoundError
 from graspd.service.pipeline.backends import Services
@@ -120,7 +127,7 @@ def test_an_interval_holds_the_estimate_and_shrinks(services: Services) -> None:
 def test_batches_that_differ_widen_the_interval() -> None:
     of, sizes = ("claw", "cube", "cpu", JobRequest(hand="claw", object="cube")), (32, 32, 32, 1000)
     both = ([BatchCost(*of, one, *sizes) for one in times] for times in ((5.0, 5.0, 5.0), (1.0, 5.0, 25.0)))
-    even, uneven = map(machine_of, both)
+    even, uneven = map(measure_machine, both)
     assert even.factor == uneven.factor
     assert uneven.stored_spread[0] < even.stored_spread[0] < even.stored_spread[1] < uneven.stored_spread[1]
 

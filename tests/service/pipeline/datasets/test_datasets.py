@@ -15,17 +15,17 @@ from graspd.service.model import digests, errors, names
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.planning import OUTCOMES
 from graspd.service.model.projects import ProjectScope
-from graspd.service.model.records import DatasetRecord, Snapshot, SnapshotShard, object_set_of, request_of
+from graspd.service.model.records import DatasetRecord, Snapshot, SnapshotShard, create_job_request, create_object_set
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.states import AssetKind, Priority, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
-from graspd.service.pipeline.datasets.actions import DatasetRounds
+from graspd.service.pipeline.datasets.actions import DatasetController
 from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.export import Fetch, export_shards, path_of
 from graspd.service.pipeline.datasets.spec import DatasetRequest
-from graspd.service.pipeline.fidelity_choice import Resolver
+from graspd.service.pipeline.fidelity_choice import FidelityResolver
 from graspd.service.store.records import job_events, load_dataset, publish_record, put_record, scene_chart_kind
 from graspd.service.store.store import open_store
 from tests.fakes import finish, plan_all, record_of
@@ -47,11 +47,11 @@ def test_the_same_dataset_repeats_nothing_and_another_needs_another_name(service
     actions.create(services, wanted())
     plan_all(services)
     finish(services, jobs_of(services, "grasps")[0])
-    queued = services.queue.waiting()
+    queued = services.queue.waiting_tasks()
     again, new = actions.create(services, wanted())
     plan_all(services)
     assert not new and again.states[State.SUCCEEDED] == 1
-    assert services.queue.waiting() == queued
+    assert services.queue.waiting_tasks() == queued
     assert len(services.index.jobs.page().items) == 4
     with pytest.raises(errors.ConflictError, match=r"objects are ball, cube; its grasps is 32\); take another name"):
         actions.create(services, wanted(objects=("ball",), grasps=64))
@@ -60,11 +60,11 @@ def test_the_same_dataset_repeats_nothing_and_another_needs_another_name(service
 def test_a_planner_that_was_stopped_is_continued(services: Services) -> None:
     actions.create(services, wanted())
     ticks = iter(range(100))
-    assert DatasetRounds(services, clock=lambda: next(ticks)).advance(2.5)
+    assert DatasetController(services, clock=lambda: next(ticks)).advance(2.5)
     assert [cell.planned for cell in services.index.datasets.cells("grasps").items].count(True) == 2
     plan_all(services)
     assert all(cell.planned for cell in services.index.datasets.cells("grasps").items)
-    assert not DatasetRounds(services).advance(10)
+    assert not DatasetController(services).advance(10)
 
 
 def test_records_of_an_older_graspd_are_read_and_are_the_same_dataset(services: Services) -> None:
@@ -147,7 +147,7 @@ def test_a_dataset_that_found_fewer_grasps_tells_the_outcomes(either: Services) 
 def test_cancel_stops_what_is_planned_and_what_is_not(services: Services) -> None:
     actions.create(services, wanted())
     ticks = iter(range(100))
-    DatasetRounds(services, clock=lambda: next(ticks)).advance(2.5)
+    DatasetController(services, clock=lambda: next(ticks)).advance(2.5)
     finish(services, jobs_of(services, "grasps")[0])
     assert actions.cancel(services, "grasps").cancelled
     plan_all(services)
@@ -223,7 +223,7 @@ def test_a_set_has_versions_and_the_newest_counts(either: Services) -> None:
     for objects in (["ball", "cone"], ["ball"], ["ball"], ["cone", "ball"]):
         assert set(actions.add_object_set(either, "round", objects).objects) == set(objects)
     assert len(list(either.store.list(names.OBJECT_SETS))) == 3
-    assert [view.objects for view in either.index.object_sets.newest()] == [["ball", "cone"]]
+    assert [view.objects for view in either.index.object_sets.newest_versions()] == [["ball", "cone"]]
     with pytest.raises(errors.NotFoundError, match="there is no object 'moon'"):
         actions.add_object_set(either, "round", ["moon"])
     with pytest.raises(errors.InputError, match="holds no object"):
@@ -231,7 +231,7 @@ def test_a_set_has_versions_and_the_newest_counts(either: Services) -> None:
 
 
 def test_a_set_that_broke_off_keeps_its_name_in_its_project(services: Services) -> None:
-    left = object_set_of("round", ["ball"], project="blue")
+    left = create_object_set("round", ["ball"], project="blue")
     put_record(services.store, names.object_set_key("round", left.digest), left)
     with pytest.raises(errors.ConflictError, match="take another name"):
         actions.add_object_set(services, "round", ["ball"], scope=ProjectScope("", everything=False))
@@ -332,7 +332,7 @@ def test_a_cell_without_options_is_the_job_it_always_was(monkeypatch: pytest.Mon
     """The id was computed by graspd 0.1.0 before datasets had options."""
     monkeypatch.setattr(digests, "STAGE_REVISIONS", {"synthesize": 1})
     given = {"name": "x", "hands": ["allegro"], "objects": ["mug"], "grasps": 64, "scenes": 2}
-    request = request_of(DatasetRequest.model_validate(given).shared, "allegro", "mug")
+    request = create_job_request(DatasetRequest.model_validate(given).cell_options, "allegro", "mug")
     assert digests.job_id(request, "0" * 32, "1" * 32) == "3451e42bdce0eab4549fc73883b4bbbd"
 
 
@@ -371,7 +371,7 @@ def test_auto_costs_what_it_chooses_and_needs_a_target_within_reach(services: Se
     with pytest.raises(errors.InputError, match=r"no fidelity of fast_graspd meets gsr>=0\.75"):
         actions.create(services, wanted(**AUTO | {"target": "gsr>=0.75"}))
     assert not services.store.exists(names.dataset_record_key("grasps"))
-    both = estimate(services.index, wanted(hands=("gripper",), **AUTO), Resolver(services.store))
+    both = estimate(services.index, wanted(hands=("gripper",), **AUTO), FidelityResolver(services.store))
     apart = [
         estimate(services.index, wanted(hands=("gripper",), objects=(obj,), fidelity=fidelity))
         for obj, fidelity in (("ball", "standard"), ("cube", "draft"))

@@ -24,7 +24,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.run.doctor import backends
 from graspd.service.run.doctor.backends import check_configured_store, check_store
 from graspd.service.run.doctor.checks import Check, Condition, Finding, good, run_checks
-from graspd.service.run.doctor.machine import check_data_folder, check_disk, check_limits, filesystem
+from graspd.service.run.doctor.machine import check_data_folder, check_disk, check_limits, filesystem_type
 from graspd.service.settings import Settings
 from graspd.service.store.store import Store, open_store
 from tests.fakes import finish, request
@@ -66,7 +66,7 @@ def test_a_data_folder_on_a_network_is_told(tmp_path: Path) -> None:
     elsewhere = Settings(data_dir=folder, redis_url="redis://other", index_url="postgresql+psycopg://other/graspd")
     assert check_data_folder(elsewhere, mounts=mounts).condition is Condition.GOOD
     for path, kind in ((folder, "nfs4"), (tmp_path / "tmp" / "x", "tmpfs"), (Path("/etc"), "ext4")):
-        assert filesystem(path, mounts) == kind
+        assert filesystem_type(path, mounts) == kind
     assert not folder.exists()
 
 
