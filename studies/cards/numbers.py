@@ -205,7 +205,7 @@ def _types(cell: CellTally) -> Row | None:
 
 
 def _taxonomy(cell: CellTally) -> Row | None:
-    """Return the share of each type of the GRASP taxonomy, most frequent first; None if no shard has types."""
+    """Return the share of each taxonomy type, most frequent first; None if no shard has types."""
     told = cell.column("taxonomy_type")
     if not len(told):
         return None
