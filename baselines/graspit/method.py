@@ -113,7 +113,7 @@ class GraspitOptions(Options):
     steps: int = Field(
         70_000, gt=FIRST_STEP, le=1_000_000, description=f"step at which annealing ends; it counts from {FIRST_STEP}"
     )
-    keep: int = Field(1, ge=1, le=20, description="grasps taken from each chain's list of best states")
+    keep: int = Field(1, ge=1, le=20, description="number of best states taken from each annealing run")
 
 
 @dataclass(frozen=True)

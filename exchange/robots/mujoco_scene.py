@@ -92,7 +92,7 @@ def _set_physics(tree: Element, found: Executions) -> None:
 
 
 def add_appearance(tree: Element, found: Executions, names: tuple[str, ...]) -> None:
-    """Add colours to the bodies `names`, a light, and a default view, without a change of physics."""
+    """Colour the bodies `names`; add a light and a default view, without effect on physics."""
     for name, colour in zip_longest(names, _COLOURS[: len(names)], fillvalue=_COLOURS[-1]):
         for body in tree.findall(f".//body[@name='{name}']"):
             for geom in body.iter("geom"):

@@ -100,7 +100,9 @@ def stability(
     long: Annotated[bool, typer.Option("--long", help="Add runs of 100,000 iterations.")] = False,
     threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for stability.json, stability.md and the maps.")] = None,
-    source: Annotated[list[Path] | None, typer.Option("--from", help="Use a stability.json; repeatable.")] = None,
+    source: Annotated[
+        list[Path] | None, typer.Option("--from", help="Use a stability.json instead of measuring; repeatable.")
+    ] = None,
     publish: Annotated[bool, typer.Option("--publish", help="Publish to the store, for the dashboard.")] = False,
     data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,

@@ -30,9 +30,7 @@ class Validated(View):
     """Numbers of grasps and of candidates. The yield omits grasps without validation."""
 
     grasps: int = Field(0, description="grasps stored so far")
-    valid: int = Field(
-        0, description="grasps within the geometric limits that held in validation; 0 without validation"
-    )
+    valid: int = Field(0, description="feasible grasps that held in validation; 0 without validation")
     candidates: int = Field(0, description="candidates planned for these grasps, stored or not")
     validated: int = Field(0, description="candidates tested for geometric limits and validated; 0 without validation")
 

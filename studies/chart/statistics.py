@@ -173,7 +173,7 @@ def valid_rate_bound(row: Mapping[str, Any]) -> float:
 
 
 def rounded_json_value(value: Any) -> Any:
-    """Return a JSON value: six significant digits, None for a non-number."""
+    """Return a value for JSON: floats with six significant digits, None for nan or inf."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):

@@ -99,7 +99,7 @@ def test_the_gradient_is_the_difference_quotient_of_the_energy(q: tuple[float, f
 def _annealing(iteration_in: wp.array[wp.int32], rise_in: float, uniform_in: wp.array[float], out: wp.array[wp.vec3]):
     i = wp.tid()
     cold = dfc.temperature(iteration_in[i])
-    accepted = dfc.accepted(rise_in, cold, uniform_in[i])
+    accepted = dfc.is_accepted(rise_in, cold, uniform_in[i])
     out[i] = wp.vec3(dfc.step_size(iteration_in[i]), cold, float(accepted))
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from graspd.client.dataset_commands import read_spec
 from graspd.commands.exchange import read_sets
-from graspd.commands.studies import _read_mapping as read_study
+from graspd.commands.studies import _read_record as read_study
 from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, published, replicator, webdataset
 from graspd.exchange.bench_hand import _read_mapping as read_mapping
 from graspd.exchange.bench_scene import object_of_scene, save_record

@@ -104,7 +104,7 @@ def even_points(obj: ObjectModel, count: int, rng: np.random.Generator) -> tuple
 
 
 def region_points(obj: ObjectModel, region: ContactRegion) -> tuple[Floats, NDArray[np.intp]]:
-    """Return about `SAMPLES` even points (P, 3) of a region of the surface, and their faces (P,).
+    """Return about `SAMPLES` points (P, 3), spread evenly over a region, and their faces (P,).
     Raises InputError: the region has hardly any surface."""
     count = SAMPLES
     while True:

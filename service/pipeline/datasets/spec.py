@@ -31,7 +31,7 @@ class Matrix(JobOptions):
 
     hands: Names = Field(min_length=1, max_length=1000, description="names of hands")
     objects: Names = Field((), max_length=MAX_CELLS, description="names of objects")
-    sets: Names = Field((), max_length=100, description="names of sets of objects; these follow `objects`")
+    sets: Names = Field((), max_length=100, description="names of object sets, added after `objects`")
 
     @model_validator(mode="after")
     def _require_objects(self) -> Self:
@@ -128,7 +128,7 @@ class Estimate(View):
     candidates: int = Field(description="candidates to plan for the requested grasps")
     valid: int = Field(description="expected number of grasps of the kind in `counted`")
     counted: Literal["valid", "feasible"] = Field(
-        "valid", description="grasps in `valid`; feasible: without validation"
+        "valid", description="kind of grasps that `valid` counts: valid, or feasible without validation"
     )
     tasks: int
     seconds: float

@@ -57,7 +57,7 @@ def test_head_says_what_get_would_sends_nothing_and_is_counted(http: TestClient,
         assert (head.status_code, head.content) == (200, b"")
         assert {name: head.headers.get(name) for name in same} == {name: whole.headers.get(name) for name in same}
     http.head("/healthz")
-    assert 'method="HEAD",route="/healthz"' in app.state.metrics.render(app.state.overview.snapshot()).decode()
+    assert 'method="HEAD",route="/healthz"' in app.state.metrics.render(app.state.overview.metrics_snapshot()).decode()
 
 
 def _kind(answer: Response) -> tuple[int, str | None]:

@@ -49,7 +49,7 @@ def test_a_second_service_on_a_redis_is_refused_also_at_once(first: Services, tm
     for take_over in (False, False, True):
         with pytest.raises(BusyError, match=r"Redis belongs to another graspd service.*GRASPD_REDIS_URL"):
             identify(second, take_over=take_over)
-    queue = Mock(first.queue, service=Mock(side_effect=[None, first.queue.service_id()]))
+    queue = Mock(first.queue, service_id=Mock(side_effect=[None, first.queue.service_id()]))
     with pytest.raises(BusyError, match="Redis belongs to another"):
         identify(service(tmp_path / "third", queue=queue))
 
@@ -62,7 +62,7 @@ def test_a_worker_or_an_index_of_another_store_is_refused(first: Services, tmp_p
         check_service(second.store, first.queue.service_id())
     identify(second)
     mixed = Services(first.settings, first.store, second.index, MemoryQueue())
-    with pytest.raises(BusyError, match="the index belongs to another graspd service_id"):
+    with pytest.raises(BusyError, match="the index belongs to another graspd service"):
         identify(mixed)
 
 

@@ -120,14 +120,14 @@ def test_spread_grasps_are_more_different_than_random_ones(folder: Path, tmp_pat
         assert run("balance", folder, "--spread", "6", "-o", tmp_path / name, *more).exit_code == 0
     poses = {}
     for name in ("few", "again", "other", "types"):
-        found = Grasps(open_shards(tmp_path / name).only(objects=["mug"])).arrays(
+        found = Grasps(open_shards(tmp_path / name).select(objects=["mug"])).arrays(
             "grasp/hand_pose", "quality/grasp_type"
         )
         poses[name] = found["grasp/hand_pose"]
     assert len(poses["few"]) == 6 and np.array_equal(poses["few"], poses["again"])
     assert not np.array_equal(poses["few"], poses["other"]), "the seed draws the first grasp"
     assert np.bincount(found["quality/grasp_type"]).tolist() == [0, 6, 6], "six of each type"
-    every = np.asarray(Grasps(open_shards(folder).only(objects=["mug"])).arrays("grasp/hand_pose")["grasp/hand_pose"])
+    every = np.asarray(Grasps(open_shards(folder).select(objects=["mug"])).arrays("grasp/hand_pose")["grasp/hand_pose"])
     rng = np.random.default_rng(0)
     drawn = np.mean([mean_least(every[rng.choice(len(every), 6, replace=False)]) for _ in range(20)])
     assert mean_least(poses["few"]) > 1.3 * drawn

@@ -212,8 +212,8 @@ def test_an_object_stored_by_an_earlier_version_gets_its_parts(
         earlier.setattr(repair, "parts_of", lambda *mesh: None)
         thing = object_of(store, message)
     assert thing.parts is None
-    prepare._prepared.cache_clear()
-    prepare._repaired.cache_clear()
+    prepare._prepare.cache_clear()
+    prepare._repair_file.cache_clear()
     shutil.rmtree(own_cache)
     wanted = message.request.model_copy(update={"touch_region": "part handle"})
     again = object_of(store, message.model_copy(update={"request": wanted}))

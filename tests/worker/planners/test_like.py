@@ -16,7 +16,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.options import validate
 from graspd.service.store.shards import read_shard, write_shard
-from graspd.worker.files.synthesis import SynthesisResult, synthesize_with, wrist_pose
+from graspd.worker.files.synthesis import SynthesisResult, synthesize_with_options, wrist_pose
 from graspd.worker.generation import validated_grasps
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.load import hand_from_path
@@ -30,7 +30,7 @@ DRAFT = {"fidelity": "draft", "device": "cpu", "seed": 3}
 
 
 def synth(obj: str = "mug", **options) -> SynthesisResult:
-    return synthesize_with("allegro", obj, validate(LocalOptions, DRAFT | options), processes=1)
+    return synthesize_with_options("allegro", obj, validate(LocalOptions, DRAFT | options), processes=1)
 
 
 def text_of(made: SynthesisResult, row: int = 0) -> str:

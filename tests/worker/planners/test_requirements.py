@@ -23,7 +23,7 @@ from graspd.service.model.grasp_types import BALANCED
 from graspd.service.model.transforms import quat_rotate
 from graspd.service.readers import Grasps, open_shards
 from graspd.service.readers.where import compile_expression
-from graspd.service.store.manifests import _summaries
+from graspd.service.store.manifests import _grasp_summaries
 from graspd.service.store.shards import Shard, read_shard
 from graspd.worker import generation
 from graspd.worker.batched_generation import validated_batches
@@ -264,7 +264,7 @@ def test_requirements_and_contacts_are_written_and_chosen_by_expressions() -> No
     count = len(made.arrays["quality/valid"])
     for text, chosen in (("digits = 3 and taxonomy_type = 9 and region_share >= 0.95", count), ("digits != 3", 0)):
         assert compile_expression(text)(made.arrays, {}).sum() == chosen
-    summaries = _summaries(made.arrays, made.attributes)[1]
+    summaries = _grasp_summaries(made.arrays, made.attributes)[1]
     assert count == len(summaries) > 0 and {(one.digits, one.taxonomy_type) for one in summaries} == {(3, 9)}
 
 
