@@ -253,19 +253,19 @@ class Scoring(AbstractContextManager["Scoring"]):
         held = columns.get("quality/success", np.zeros(len(rows), np.int8)) == 1
         columns["quality/valid"] = (feasible & held).astype(np.uint8)
         with _timed(seconds, "validation"):
-            columns |= self._further_tests(
-                grasps, held if every else feasible & held, feasible & held, run.without_progress()
-            )
+            failed = np.full(len(grasps), "", object)
+            if required.is_set and not every:
+                failed = required.failed(self.hand, grasps.grasp, self.placed(grasps), columns)
+            valid = feasible & held & (failed == "")
+            columns |= self._further_tests(grasps, held if every else valid, valid, run.without_progress())
         if not every:
             wanted = feasible if self.pieces is None else feasible & held
             lost = np.setdiff1d(np.arange(size), rows)
             lost = lost[fates[finite[lost]] == "kept"]
             fates[finite[lost]] = why[lost]
             fates[finite[rows[~wanted]]] = [f"gate_{name}" for name in np.asarray(failed_gate(columns))[~wanted]]
-            if required.is_set:
-                failed = required.failed(self.hand, grasps.grasp, self.placed(grasps), columns)
-                fates[finite[rows[wanted & (failed != "")]]] = failed[wanted & (failed != "")]
-                wanted &= failed == ""
+            fates[finite[rows[wanted & (failed != "")]]] = failed[wanted & (failed != "")]
+            wanted &= failed == ""
             if self.request.robust:
                 enough = reaches_share(columns["quality/robust_share"], self.request.robust)
                 fates[finite[rows[wanted & ~enough]]] = "not_robust"

@@ -46,8 +46,8 @@ MAX_PRESSING: Final = 16
 CLOSING_M: Final = 0.009
 #: Least and largest distance at which a finger stands off the object [m]. Farther fingers are not part of the grasp.
 STANDS_OFF_M: Final = (0.005, 0.02)
-#: Reach of distance measurements of such fingers [m].
-FAR_M: Final = 0.065
+#: Distances of such fingers are measured up to this far beyond the largest one [m].
+BEYOND_M: Final = 0.005
 #: Largest number of closing steps of such fingers (`opening.dof_steps`), and their distance at the end [m]. Between two
 #: sampled points, a finger's surface is up to half a millimetre closer.
 CLOSING_STEPS: Final = 16
@@ -162,9 +162,9 @@ def close_fingers(
         return grasp
     pose, finger, joints = grasp.hand_pose[rows], fingers_of_dofs(hand), np.array(grasp.joint_positions, float)
     q, moved = hand.reduce(joints[rows]), off[rows][:, finger] & (finger >= 0)
-    closing = Openings(posing, pose, q, _close_until_contact(posing, pose, q, moved))
+    closing = Openings(posing, pose, q, _close_until_contact(posing, pose, q, moved, off_m[1] + BEYOND_M))
     closed = closing.without_jams(_blocked_paths(hand, closing, None if placed is None else placed.take(rows)))
-    reached = posing.finger_gaps(Posture(pose, hand.expand(closed)), FAR_M) < off_m[0]
+    reached = posing.finger_gaps(Posture(pose, hand.expand(closed)), off_m[1] + BEYOND_M) < off_m[0]
     joints[rows] = hand.expand(np.where(moved & reached[:, finger], closed, q))
     return Posture(np.array(grasp.hand_pose, float), joints)
 
@@ -174,17 +174,20 @@ def _fingers_off_object(
 ) -> NDArray[np.bool_]:
     """Return a mask (N, F) of fingers at a distance from the object in `off_m`."""
     near, far = off_m
-    gap = posing.finger_gaps(grasp, FAR_M)
+    gap = posing.finger_gaps(grasp, far + BEYOND_M)
     return np.asarray((gap > near) & (gap < far))
 
 
-def _close_until_contact(posing: PostureData, hand_pose: Floats, q: Floats, moved: NDArray[np.bool_]) -> Floats:
-    """Return dofs (n, D); those `moved` (n, D) are closed until their finger's distance is `CLOSED_M`."""
+def _close_until_contact(
+    posing: PostureData, hand_pose: Floats, q: Floats, moved: NDArray[np.bool_], reach: float
+) -> Floats:
+    """Return dofs (n, D); those `moved` (n, D) are closed until their finger's distance is `CLOSED_M`.
+    Distances are measured up to `reach` [m]."""
     hand, count, looks = posing.hand, len(q), CLOSING_STEPS + 1
     step = moved * hand.closing * dof_steps(hand)
     path = np.clip(q[:, None] + np.arange(looks)[None, :, None] * step[:, None], hand.lower, hand.upper)
     postures = Posture(np.repeat(hand_pose, looks, axis=0), hand.expand(path.reshape(count * looks, -1)))
-    gaps = posing.finger_gaps(postures, FAR_M).reshape(count, looks, -1)
+    gaps = posing.finger_gaps(postures, reach).reshape(count, looks, -1)
     last = np.maximum((gaps <= CLOSED_M).argmax(axis=1), 1)[:, None]
     before, after = (np.take_along_axis(gaps, at, axis=1)[:, 0] for at in (last - 1, last))
     share = np.clip((before - CLOSED_M) / np.maximum(before - after, 1e-9), 0.0, 1.0)

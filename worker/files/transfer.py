@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -36,6 +35,8 @@ from graspd.worker.quality.probe import HAND_POINTS, probe_of
 MARGIN_M: Final = 0.015
 #: Largest angle between the palms' approaches [deg].
 CONE_DEG: Final = 60.0
+#: Root attributes that are those of the other hand's grasps.
+_INHERITED: Final = ("object", "object_digest", "object_source", "object_options", "method", "fidelity")
 #: Candidates per grasp.
 BUDGET: Final = 8.0
 
@@ -72,11 +73,6 @@ def requests_of(
             "touch_region": ", ".join(bounds),
             "approach_cone": ", ".join(f"{value:.4f}" for value in axis) + f", {CONE_DEG:g}",
         }
-        attributes = shard.attributes
-        given |= {
-            "mass": float(str(attributes["object_mass_kg"])),
-            "object_friction": float(str(attributes["object_friction"])),
-        }
         found[row] = validate(JobOptions, given | {"grasps": 1, "seed": seed + row, "budget": BUDGET, "rechecks": 0})
     return found
 
@@ -104,8 +100,7 @@ def transfer_grasps(
     for number, (row, request) in enumerate(requests.items()):
         run.progress(number, len(requests), "transfer")
         run.check("transfer")
-        heavy = replace(thing, mass=request.mass or thing.mass)
-        batches[row] = validated_grasps(target, heavy, request, count=1, run=run.without_progress())
+        batches[row] = validated_grasps(target, thing, request, count=1, run=run.without_progress())
     rows = [row for row, batch in batches.items() if len(batch.grasps)]
     if not rows:
         raise InputError(f"none of {len(requests)} grasps of {shard.path} can be transferred to {target.name}")
@@ -117,8 +112,7 @@ def transfer_grasps(
     told: dict[str, Attribute] = {
         "hand": target.name,
         "hand_digest": target.digest,
-        **{name: shard.attributes[name] for name in ("object", "object_digest", "object_mass_kg")},
-        **{name: shard.attributes[name] for name in ("fidelity", "method") if name in shard.attributes},
+        **{name: shard.attributes[name] for name in _INHERITED if name in shard.attributes},
         "transferred_from": json_attribute({"shard": str(shard.attributes.get("shard_id", "")), "rows": rows}),
         "shard_id": id_of_columns(arrays),
     }

@@ -200,7 +200,7 @@ def test_every_constant_is_said_to_move_verdicts_or_not() -> None:
     # A new constant belongs in key.py, or here if no verdict depends on it.
     # These move lifts (lifting.py has them), short tests, or the choice of grasps.
     still = "postures.ROOM_M postures.WIDE model.TOUCH_ROUNDING_M protocol.STILL protocol.LOST postures.STANDS_OFF_M "
-    still += "postures.FAR_M postures.CLOSING_STEPS postures.CLOSED_M "
+    still += "postures.BEYOND_M postures.CLOSING_STEPS postures.CLOSED_M "
     # These move pregrasps, which are validated; the object, which is in the key; and the bound of masses.
     still += "postures.RAISE_LOOKS postures.RAISE_OPEN_M postures.RAISE_CLOSING_M postures.HIGHEST_RAISE_M "
     still += "matter.MASS_KG matter.FRICTION matter.MOST_KG"
