@@ -349,8 +349,10 @@ def _optimise_part(launch: _Launch, begun: _Starts, beat: Floats | None = None) 
         def rollout(grasps: GraspSet, which: Rows, beat: Floats) -> Floats:
             return batches.rollout(grasps, rows[which], beat)
 
-        together = 1 if placed is None else TOGETHER
         device = pair.hand.device
+        together = 1 if placed is None else TOGETHER
+        if device.startswith("cuda"):  # a launch takes the time of its slowest hand
+            together = order.shape[1]
         taken = select_by_rollout(
             hand, obj, order, fine_phase.refine, placed, rollout, beat=beat, together=together, device=device
         )
