@@ -197,8 +197,8 @@ def page(result: dict[str, Any]) -> str:
             "",
             f"Whole chain: {result['chain_grasps']} valid grasps (CPU: a quarter of them) at level standard and "
             "0.1 kg, with metrics. *Valid*: share of the candidates that are valid; *hard*: share of valid grasps that "
-            "hold at half friction. Rollouts select among the candidates of a grasp in MuJoCo on the CPU; with the prefilter, "
-            "MuJoCo Warp decides clear verdicts of unselected candidates on the GPU.",
+            "hold at half friction. Rollouts select among a grasp's candidates in MuJoCo on the CPU; with the "
+            "prefilter, MuJoCo Warp decides clear verdicts of unselected candidates on the GPU.",
             "",
             "| hand | object | device | way | valid/s | valid | hard |",
             "| --- | --- | --- | --- | --: | --: | --: |",

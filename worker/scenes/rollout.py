@@ -37,8 +37,6 @@ TOUCHES: Final = 2.0
 FALLS: Final = 0.4
 #: Highest score of a candidate that lifts at half friction.
 BEST: Final = 0.99
-#: Number of free grasps per task of a process pool: few, so that many processes share one batch.
-CHUNK: Final = 2
 #: Planners on the CPU already use all threads.
 ONE_THREAD: Final = ExecutionContext(threads=1)
 
@@ -87,9 +85,9 @@ def hold_rollout(
         if run.pool is None:
             score, verdicts = case.score(grasps, beat, run.cores)
         else:
-            rows = [np.arange(k, min(k + CHUNK, len(grasps))) for k in range(0, len(grasps), CHUNK)]
+            rows = np.arange(len(grasps))
             bare = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
-            parts = [(bare.take(some), beat[some]) for some in rows]
+            parts = [(bare.take(some), beat[some]) for some in rows[:, None]]
             made = run.pool.map(_score_part, content_digest(case), case, parts, cancelled=run.cancelled)
             score = np.concatenate([part for part, _ in made])
             verdicts = dict(pair for _, part in made for pair in part.items())
