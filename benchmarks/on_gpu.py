@@ -60,8 +60,8 @@ COLUMNS: Final = {"epsilon": 3, "penetration_depth_mm": 2, "contact_area_cm2": 1
 SHOWN: Final = {"gsr": 2, **COLUMNS}
 #: Pairs of the whole chain.
 CHAIN: Final = (("Allegro", "025_mug"), ("Barrett", "003_cracker_box"), ("Shadow", "006_mustard_bottle"))
-#: Ways of validation: the candidates' selection by rollouts on the CPU, or the prefilter on the GPU.
-WAYS: Final[dict[str, PrefilterMode]] = {"rollouts": "off", "prefilter": "on"}
+#: Engines of the verdicts: MuJoCo on the CPU alone, or after the prefilter on the GPU.
+ENGINES: Final[dict[str, PrefilterMode]] = {"MuJoCo": "off", "prefilter": "on"}
 
 
 def say(line: str) -> None:
@@ -117,13 +117,13 @@ def speed(hand: HandModel, obj: ObjectModel, device: str, batches: Sequence[int]
     return [{"batch": batch, **stages(hand, obj, device, batch)} for batch in batches]
 
 
-def chain(hand: HandModel, obj: ObjectModel, device: str, way: str, count: int) -> dict[str, Any]:
+def chain(hand: HandModel, obj: ObjectModel, device: str, engine: str, count: int) -> dict[str, Any]:
     """Return valid grasps per second of the whole chain, their share of candidates, and the share of valid grasps
     that holds at half friction."""
     request = JobOptions(grasps=count, seed=SEED, mass=MASS_KG, rechecks=0)
     join, processes = batches_per_launch(device, None), pool_process_count(device, 0)
     with Pool(processes, MODULES) if processes > 1 else nullcontext() as pool:
-        run = ExecutionContext(device, prefilter=WAYS[way], pool=pool)
+        run = ExecutionContext(device, prefilter=ENGINES[engine], pool=pool)
 
         def make(grasps: int, first: int) -> tuple[list[ValidatedBatch], float]:
             sizes = [min(BATCH_SIZE, grasps - k) for k in range(0, grasps, BATCH_SIZE)]
@@ -197,14 +197,13 @@ def page(result: dict[str, Any]) -> str:
             "",
             f"Whole chain: {result['chain_grasps']} valid grasps (CPU: a quarter of them) at level standard and "
             "0.1 kg, with metrics. *Valid*: share of the candidates that are valid; *hard*: share of valid grasps that "
-            "hold at half friction. Rollouts select among a grasp's candidates in MuJoCo on the CPU; with the "
-            "prefilter, MuJoCo Warp decides clear verdicts of unselected candidates on the GPU.",
+            "hold at half friction. On the CPU, rollouts select among a grasp's candidates.",
             "",
-            "| hand | object | device | way | valid/s | valid | hard |",
+            "| hand | object | device | engine | valid/s | valid | hard |",
             "| --- | --- | --- | --- | --: | --: | --: |",
         ]
         lines += [
-            f"| {row['hand']} | {row['object']} | {row['device']} | {row['way']} | {row['valid_per_s']:.0f} | "
+            f"| {row['hand']} | {row['object']} | {row['device']} | {row['engine']} | {row['valid_per_s']:.0f} | "
             f"{row['share']:.2f} | {row['hard']:.2f} |"
             for row in result["chain"]
         ]
@@ -249,13 +248,14 @@ def main() -> None:
     for name, hand in hands.items():
         result["speed"][name] = speed(hand, meshes[OBJECTS[0]], device, wanted.batches)
         keep()
-    ways = [(device, "rollouts"), ("cpu", "rollouts"), (device, "prefilter")] if wanted.chain else []
-    for at, way in ways:
+    for at, engine in ((device, "MuJoCo"), ("cpu", "MuJoCo"), (device, "prefilter")) if wanted.chain else ():
         for name, mesh in CHAIN:
-            if way == "prefilter" and name == "Shadow":
+            if engine == "prefilter" and name == "Shadow":
                 continue  # the prefilter does not test hands with tendons
-            found = chain(hands[name], meshes[mesh], at, way, wanted.chain // (4 if at == "cpu" else 1))
-            result["chain"].append({"hand": name, "object": mesh, "device": at.split(":")[0], "way": way, **found})
+            found = chain(hands[name], meshes[mesh], at, engine, wanted.chain // (4 if at == "cpu" else 1))
+            result["chain"].append(
+                {"hand": name, "object": mesh, "device": at.split(":")[0], "engine": engine, **found}
+            )
             keep()
             print(result["chain"][-1], file=sys.stderr, flush=True)  # noqa: T201
     pair = planner.pair_of(hands["Allegro"], meshes[OBJECTS[0]], FIDELITY, device)

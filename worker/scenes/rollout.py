@@ -4,8 +4,8 @@ Candidates that pass these tests (`worker.validation.prescreening`) are validate
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +15,6 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.disk_cache import content_digest
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
@@ -23,7 +22,6 @@ from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.lifting import KnownLifts, LiftLevel, validate_lifts
-from graspd.worker.validation.prefilter.prefilter import prefilter_key_terms
 from graspd.worker.validation.prescreening import SLIPS, ShortTests
 from graspd.worker.validation.validator import KnownRollouts, validate
 
@@ -37,8 +35,6 @@ TOUCHES: Final = 2.0
 FALLS: Final = 0.4
 #: Highest score of a candidate that lifts at half friction.
 BEST: Final = 0.99
-#: Planners on the CPU already use all threads.
-ONE_THREAD: Final = ExecutionContext(threads=1)
 
 
 def create_rollout(
@@ -52,15 +48,12 @@ def create_rollout(
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats] | None:
     """Return the rollout function for the device of `run`, or None. `known` caches verdicts of `level`.
-    On a GPU, rollouts use all cores. Free grasps have no rollouts there if the prefilter is on."""
+    A GPU has no rollouts of free grasps, since it plans faster than a CPU simulates; in scenes they use all threads."""
     on_gpu = run.device.startswith("cuda")
-    if in_scenes:
-        threads = run.cores if on_gpu else 1
-        return lift_rollout(hand, obj, pieces, threads=threads, known=known, level=lift_level(level))
-    if on_gpu and prefilter_key_terms(hand, level, run):
-        return None
-    own = run.without_progress() if on_gpu else ONE_THREAD
-    return hold_rollout(hand, obj, pieces, known=known, level=level, run=own)
+    if not in_scenes:
+        return None if on_gpu else hold_rollout(hand, obj, pieces, known=known, level=level)
+    threads = run.cores if on_gpu else 1
+    return lift_rollout(hand, obj, pieces, threads=threads, known=known, level=lift_level(level))
 
 
 def hold_rollout(
@@ -70,64 +63,24 @@ def hold_rollout(
     *,
     known: KnownRollouts | None = None,
     level: Level = "standard",
-    run: ExecutionContext = ONE_THREAD,
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
-    Grasps with scores below both 2 and `beat` are validated at `level`; those that fail score at least 2. Rollouts use
-    the processes of `run`, or its threads."""
-    cases = list[_FreeCase]()
+    Grasps with scores below both 2 and `beat` are validated at `level`; those that fail score at least 2."""
+    shorts, run = ShortTests(hand, obj, pieces), ExecutionContext(threads=1)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
-        if not cases:
-            cases.append(_FreeCase(hand, obj, pieces(), level))
-        (case,), grasps = cases, grasps.moved(np.zeros(3))
+        grasps = grasps.moved(np.zeros(3))
         beat = np.full(len(grasps), np.inf) if beat is None else beat
-        if run.pool is None:
-            score, verdicts = case.score(grasps, beat, run.cores)
-        else:
-            rows = np.arange(len(grasps))
-            bare = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
-            parts = [(bare.take(some), beat[some]) for some in rows[:, None]]
-            made = run.pool.map(_score_part, content_digest(case), case, parts, cancelled=run.cancelled)
-            score = np.concatenate([part for part, _ in made])
-            verdicts = dict(pair for _, part in made for pair in part.items())
-        if known is not None:
-            known.update(verdicts)
-        return score
-
-    return rollout
-
-
-@dataclass(frozen=True)
-class _FreeCase:
-    """Free object in a hand, for rollouts in this process or in a pool."""
-
-    hand: HandModel
-    obj: ObjectModel
-    pieces: ConvexPieces
-    level: Level
-
-    @cached_property
-    def shorts(self) -> ShortTests:
-        return ShortTests(self.hand, self.obj, lambda: self.pieces)
-
-    def score(self, grasps: GraspSet, beat: Floats, threads: int = 1) -> tuple[Floats, KnownRollouts]:
-        """Return scores (N,) and the verdicts found; see `hold_rollout`."""
-        known: KnownRollouts = {}
-        score = self.shorts.scores(grasps, None, beat, threads)
+        score = shorts.scores(grasps, None, beat)
         # Skip candidates that cannot beat the previous score.
         held = np.flatnonzero((score < SLIPS + 1.0) & (score < beat))
         if len(held):
-            common: dict[str, Any] = {"level": self.level, "pieces": self.pieces, "known": known}
-            run = ExecutionContext(threads=threads)
-            verdicts = validate(self.hand, self.obj, grasps.take(held), run=run, **common)
+            verdicts = validate(hand, obj, grasps.take(held), level=level, pieces=pieces(), known=known, run=run)
             fell = held[verdicts.success != 1]
             score[fell] = SLIPS + 1.0 + FALLS * np.minimum(score[fell], 1.0)
-        return score, known
+        return score
 
-
-def _score_part(case: _FreeCase, part: tuple[GraspSet, Floats]) -> tuple[Floats, KnownRollouts]:
-    return case.score(*part)
+    return rollout
 
 
 def lift_rollout(
@@ -142,14 +95,14 @@ def lift_rollout(
     """Return a `worker.planners.Rollout` that scores grasps (N,) in scenes by short lifts.
     A grasp with a clear trajectory scores below 1 if it lifts at half friction, below 2 if at full friction.
     Candidates that hold the hanging object briefly are validated by the whole lift test: a squeeze may slowly turn an
-    object out of the hand. `threads` are per call."""
-    shorts, run = ShortTests(hand, obj, pieces), ExecutionContext(threads=threads)
+    object out of the hand. `threads` are per call; on the CPU, planners already use all threads."""
+    shorts, run = ShortTests(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
         assert placed is not None, "a lift needs a scene"
         beat = np.full(len(grasps), np.inf) if beat is None else beat
         grasps = grasps.moved(np.zeros(3))
-        score = shorts.scores(grasps, placed, beat, threads)
+        score = shorts.scores(grasps, placed, beat)
         # Skip candidates that cannot beat the previous score.
         held = np.flatnonzero((score < SLIPS + 1.0) & (score < beat))
         if not len(held):

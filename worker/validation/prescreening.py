@@ -130,14 +130,14 @@ class ShortPushTest(Test):
 class ShortTests:
     """Short tests of one hand and one object with common supports and neighbours; thread-safe."""
 
-    def __init__(self, hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces]) -> None:
-        self.hand, self.obj, self._pieces = hand, obj, pieces
+    def __init__(
+        self, hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
+    ) -> None:
+        self.hand, self.obj, self._pieces, self.threads = hand, obj, pieces, threads
         self._scenes: Frictions | None = None
         self._lock = threading.Lock()
 
-    def scores(
-        self, grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None, threads: int = 1
-    ) -> Floats:
+    def scores(self, grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
         """Return scores (N,) (`worker.planners.Rollout`), by lifts if `placed` is given, else by pushes.
         Scores are below 1 for grasps that hold at half friction, and below 2 for those that hold at full friction."""
         with self._lock:
@@ -156,7 +156,7 @@ class ShortTests:
         def score(test: ShortLiftTest | ShortPushTest, row: int) -> float:
             return test.score(grasps, row, float(least[row]))
 
-        return np.array(evaluate_rows(range(len(grasps)), make, score, threads=threads, name="short-test"), float)
+        return np.array(evaluate_rows(range(len(grasps)), make, score, threads=self.threads, name="short-test"), float)
 
 
 HANGING_CLOSING: Final = 4  # number of stages of closing and of squeezing

@@ -3,10 +3,8 @@
 The trial of candidates is the test of the validator itself, which is then not done again.
 """
 
-from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +15,6 @@ from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture, join_grasp_sets
-from graspd.worker.pool.pool import Pool
 from graspd.worker.scenes import rollout as rollouts
 from graspd.worker.scenes.rollout import BEST, FALLS, TOUCHES, hold_rollout, lift_rollout, scene_verdicts
 from graspd.worker.simulation.environment import Neighbour, Obstacle, PlacedGrasps
@@ -186,7 +183,7 @@ def test_a_neighbour_that_leans_or_slides_has_moved() -> None:
 
 def scores(*squeezes: float, threads: int = 1) -> np.ndarray:
     grasps = join_grasp_sets([grasp(squeeze) for squeeze in squeezes])
-    return ShortTests(HAND, BOX, lambda: WHOLE).scores(grasps, placed(len(squeezes)), threads=threads)
+    return ShortTests(HAND, BOX, lambda: WHOLE, threads=threads).scores(grasps, placed(len(squeezes)))
 
 
 def test_the_box_falls_by_what_friction_does_not_carry() -> None:
@@ -441,20 +438,6 @@ def test_free_grasp_that_the_validator_drops_is_no_good_candidate(monkeypatch, v
     monkeypatch.setattr(ShortTests, "scores", lambda *_: np.array([0.2, 4.0, 4.0]))
     monkeypatch.setattr(rollouts, "validate", lambda *_, **__: SimpleNamespace(success=np.array([verdict])))
     assert hold_rollout(HAND, BOX, lambda: WHOLE)(THREE, None).tolist() == pytest.approx([score, 4.0, 4.0])
-
-
-@pytest.mark.parametrize("processes", [0, 2])
-def test_rollouts_of_free_grasps_are_the_same_in_threads_and_processes(processes: int) -> None:
-    grasps = join_grasp_sets(
-        [grasp(squeeze) for squeeze in (0.2 * ACROSS * LEAST_PUSHED, 2.4 * ACROSS * LEAST_PUSHED, 0.5)]
-    )
-    alone, shared = dict[str, Any](), dict[str, Any]()
-    expected = hold_rollout(HAND, BOX, lambda: WHOLE, known=alone)(grasps, None)
-    with Pool(processes) if processes else nullcontext() as pool:
-        run = ExecutionContext(threads=2, pool=pool)
-        found = hold_rollout(HAND, BOX, lambda: WHOLE, known=shared, run=run)(grasps, None)
-    assert found.tolist() == expected.tolist()
-    assert shared == alone
 
 
 def test_a_free_grasp_that_cannot_beat_another_is_not_validated(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,8 +69,6 @@ STANDS: Final = 1.99
 #: the first limit; grasps with a finger off the object also exceed the second. Later attempts are as productive as the
 #: first. They hardly change the yield per second, but fewer grasps of hard pairs of hand and object fail.
 FREE: Final = (GOOD, STANDS, *(FAILED,) * 18)
-#: The same on a GPU. Small launches leave it idle, so a grasp that fails again is replaced in the next large launch.
-FREE_ON_GPU: Final = (GOOD, STANDS, FAILED)
 #: Grasps in scenes with larger scores are retried; one limit for each attempt. A grasp with a finger off the object
 #: exceeds only the first limit; a grasp that fails only at half friction exceeds the first five. Five attempts instead
 #: of two raise the share that lifts at half friction from .63 to .67 at 3 % more time (Allegro, 12 objects, own mass).
@@ -351,10 +349,8 @@ def _optimise_part(launch: _Launch, begun: _Starts, beat: Floats | None = None) 
         def rollout(grasps: GraspSet, which: Rows, beat: Floats) -> Floats:
             return batches.rollout(grasps, rows[which], beat)
 
-        device = pair.hand.device
         together = 1 if placed is None else TOGETHER
-        if device.startswith("cuda"):  # a launch takes the time of its slowest hand
-            together = order.shape[1]
+        device = pair.hand.device
         taken = select_by_rollout(
             hand, obj, order, fine_phase.refine, placed, rollout, beat=beat, together=together, device=device
         )
@@ -372,9 +368,7 @@ def _retry(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> LaunchPa
     """Retry grasps with a poor score or merit; select the first good attempt, else the best one.
     The last few grasps would leave cores idle, and a hand costs a third more in a small launch. Several of their
     attempts therefore run at once. Attempts after a good one are dropped, so the result equals sequential attempts."""
-    limits: tuple[float, ...] = FREE_ON_GPU if run.device.startswith("cuda") else FREE
-    if not launch.batches.has_rollout:
-        limits = (SET_OUT_AGAIN,)
+    limits: tuple[float, ...] = FREE if launch.batches.has_rollout else (SET_OUT_AGAIN,)
     if launch.batches.placed is not None:
         limits = IN_SCENES
     done = 0
