@@ -5,6 +5,7 @@ from __future__ import annotations
 import posixpath
 import re
 from collections.abc import Mapping
+from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -96,11 +97,9 @@ def _preference_key(name: str) -> tuple[int, str]:
 
 
 def _unique_name(text: str, taken: Mapping[str, str]) -> str:
-    name = shorten_name(re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object", 60)
-    number = 2
-    while name in taken:
-        name, number = f"{name[:57]}-{number}", number + 1
-    return name
+    base = shorten_name(re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object", 60)
+    numbered = (f"{base[:56]}-{number}" for number in count(2))
+    return next(name for name in chain([base], numbered) if name not in taken)
 
 
 def _object_files(files: Mapping[str, bytes], mesh: str) -> dict[str, bytes]:

@@ -25,6 +25,10 @@ _LEVELS: Final = {
     "standard": "MuJoCo, DexGraspBench's protocol with early termination of pushes",
     "fast": "MuJoCo with coarse physics; level standard decides cases near a limit",
 }
+#: The same for grasps planned in scenes.
+_LIFT_LEVELS: Final = {"dexgraspbench": "MuJoCo, DexGraspBench's tabletop test"} | dict.fromkeys(
+    ("standard", "fast"), "MuJoCo, lift out of the scene"
+)
 _REJECTED: Final = {
     "dropped": "rejected by the validator",
     "gate": "failed the gate",
@@ -85,12 +89,13 @@ def yaml_head(card: Row) -> dict[str, Any]:
 
 def _origins(card: Row) -> dict[str, str]:
     making, valid, threshold = card["making"], card["composition"]["valid"], card["contact_threshold_m"]
+    levels = _LIFT_LEVELS if making["scenes"] else _LEVELS
     each = ", ".join(f"{kind} {1000 * value / (valid or 1):,.0f} s" for kind, value in making["seconds"].items())
     total = making["seconds_per_1000_valid"]
     rows = {
         "method, fidelity": f"{', '.join(making['methods'])}; "
         + ", ".join(str(found.get("name", "custom")) for found in making["fidelities"]),
-        "validation": "; ".join(_LEVELS.get(level, level) for level in making["levels"]) or "none",
+        "validation": "; ".join(levels.get(level, level) for level in making["levels"]) or "none",
         "imported from": ", ".join(making["imported_from"]),
         "requirements": "; ".join(cell_text(text) for text in making["requirements"]),
         "friction of ε and Vol": ", ".join(f"{value:g}" for value in making["friction"]),
