@@ -34,12 +34,19 @@ SOLVERS: Final[dict[str, tuple[Any, Solver]]] = {
 
 
 def run_kernel(
-    name: str, contacts: Contacts, world: World, *, near_gap: float = 100.0, lane: int = 64
+    name: str,
+    contacts: Contacts,
+    world: World,
+    *,
+    leak: float = 0.0,
+    one_sided: bool = True,
+    near_gap: float = 100.0,
+    lane: int = 64,
 ) -> tuple[Floats, Floats, Floats]:
     """Run a kernel of `SOLVERS` on the CPU; return motions at the end (M, 6), losses (M,), dL/drho (N,)."""
     motions = initial_motions(7, world.step, world.gyration)
     n, m = len(contacts.points), len(motions)
-    physics = _physics(world, near_gap, float(np.linalg.norm(contacts.points, axis=1).max()))
+    physics = _physics(world, leak, one_sided, near_gap, float(np.linalg.norm(contacts.points, axis=1).max()))
     listed = np.flatnonzero(contacts.distances - world.dilation <= near_gap)
     with wp.ScopedDevice("cpu"):
         hands, given = kinematics.Hands(), packing.Contacts()
@@ -99,12 +106,12 @@ def gradient_map(sizes: Sequence[float], gaps: Sequence[float], *, repeats: int)
     )
 
 
-def _physics(world: World, near_gap: float, radius: float) -> Any:
+def _physics(world: World, leak: float, one_sided: bool, near_gap: float, radius: float) -> Any:
     out = contact.Physics()
     out.mass = contact.mat66(*world.mass.ravel().tolist())
     out.inverse_mass = contact.mat66(*np.linalg.inv(world.mass).ravel().tolist())
     out.gyration, out.friction, out.stiffness = world.gyration, world.friction, world.stiffness
-    out.leak, out.leak_length, out.one_sided, out.step = 0.0, 0.02, 1, world.step
+    out.leak, out.leak_length, out.one_sided, out.step = leak, 0.02, int(one_sided), world.step
     out.radius, out.near_gap = radius, near_gap
     return out
 
