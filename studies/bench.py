@@ -19,7 +19,7 @@ import warp as wp
 from graspd.service.model.cores import available_cores
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.studies.layout import markdown_table, new_figure, plain_axes
+from graspd.studies.figures import markdown_table, new_figure, plain_axes
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel

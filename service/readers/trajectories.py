@@ -96,6 +96,6 @@ def scene_spec_of(shard: Shard) -> SceneSpec | None:
 
 
 def planned_scene_of(shard: Shard) -> SceneSpec | None:
-    """Return the scene in which a shard's grasps were planned; None for free objects. InputError if invalid."""
+    """Return the scene in which grasps were planned, None for free ones; InputError if invalid."""
     spec = scene_spec_of(shard)
     return None if spec is None or spec.kind == "free" or "grasp/scene_index" not in shard.arrays else spec

@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from graspd.service.model.metrics import GRASP_METRICS
 from graspd.studies.cards.findings import findings
-from graspd.studies.layout import markdown_table
+from graspd.studies.figures import markdown_table
 from graspd.worker.quality import gate as gates
 
 Row = Mapping[str, Any]

@@ -10,7 +10,7 @@ import numpy as np
 
 from graspd.service.model.metrics import GRASP_METRICS
 from graspd.studies.cards.tally import Tally, cell_counts
-from graspd.studies.layout import COLOURS, INK, new_figure, plain_axes
+from graspd.studies.figures import COLOURS, INK, new_figure, plain_axes
 
 Row = Mapping[str, Any]
 _NAMED: Final = 40  # largest number of objects of a matrix that shows names and numbers

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.studies.chart.statistics import valid_rate_bound
-from graspd.studies.layout import COLOURS, INK, new_figure, plain_axes
+from graspd.studies.figures import COLOURS, INK, new_figure, plain_axes
 
 Row = Mapping[str, Any]
 Rows = Sequence[Row]

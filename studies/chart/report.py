@@ -11,7 +11,7 @@ from typing import Any, Final
 from graspd.service.model.studies import FILTERED, IN_SCENE, IN_SCENES
 from graspd.studies.chart.figure import SPEED, draw, draw_hands, draw_scenes, draw_sweeps, fidelity_label
 from graspd.studies.chart.statistics import valid_rate_bound
-from graspd.studies.layout import markdown_table
+from graspd.studies.figures import markdown_table
 
 Row = Mapping[str, Any]
 

@@ -18,7 +18,7 @@ from graspd.service.model.studies import (
     format_tick,
     tick_position,
 )
-from graspd.studies.layout import markdown_table, new_figure
+from graspd.studies.figures import markdown_table, new_figure
 
 #: Colours (fill, text) by outcome, distinguishable by lightness alone.
 COLOURS: Final = {

@@ -25,6 +25,6 @@ def plain_axes(axes: Any, *, grid_below: bool = False) -> None:
 
 
 def markdown_table(headings: str, rows: Iterable[Sequence[object]], *, left: int = 1) -> str:
-    """Return a table; `headings` are separated by |, the first `left` columns are aligned left, others right."""
+    """Return a table; | separates `headings`; the first `left` columns align left, others right."""
     sides = ["---"] * left + ["--:"] * (headings.count(" | ") + 1 - left)
     return "\n".join(f"| {' | '.join(map(str, row))} |" for row in ([headings], sides, *rows))
