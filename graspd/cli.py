@@ -31,7 +31,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("render", "graspd.commands.render", "Make grasps", "Render pictures of scenes with labels."),
     ("chart", "graspd.commands.studies", "Make grasps", "Compare speed and accuracy of methods and fidelities."),
     ("bench", "graspd.commands.studies", "Make grasps", "Measure grasps per second and the time of each step."),
-    ("stability", "graspd.commands.studies", "Make grasps", "Map where integrators and planners fail."),
+    ("stability", "graspd.commands.studies", "Make grasps", "Map where planners fail."),
     ("pictures", "graspd.commands.render", "Use grasps", "Draw the best grasps of a file on one sheet."),
     ("view", "graspd.commands.render", "Use grasps", "Show grasps of a file in 3D in the browser."),
     ("grasps", "graspd.commands.curate", "Use grasps", "Select grasps of files and datasets by their metrics."),

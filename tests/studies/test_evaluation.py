@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from benchmarks import learned
 from benchmarks.cells import planned
+from benchmarks.integrators.reference import Contacts, World, direct
 from benchmarks.modelling.common import auc, ranking
 from benchmarks.modelling.drops import drops, forearm
 from benchmarks.modelling.steps import forward_simulation, step
@@ -40,7 +41,6 @@ from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.probe import probe_of
 from graspd.worker.rendering import render
 from graspd.worker.scenes import drop
-from graspd.worker.simulation.reference import Contacts, World, direct
 from tests.conftest import REPOSITORY
 from tests.networks import random_network
 from tests.worker.commands_run import graspd, refused
