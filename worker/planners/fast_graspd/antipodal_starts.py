@@ -396,7 +396,7 @@ class ReachSampling:
     model: Model
     grips: Any
     only: bool
-    """Whether all starts are antipodal, because the object is too small or too wide for the pads.
+    """Whether all starts are antipodal, because the object is too small or too wide for the pads, or its region thin.
     Starts with the palm towards a random point then rarely succeed."""
 
     @classmethod
