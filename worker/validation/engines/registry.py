@@ -1,4 +1,6 @@
-"""Engines by name, and verdicts on grasps in one of them or in several."""
+"""Engines by name, and verdicts on grasps in one of them or in several.
+
+The module of an engine has its name and a constant `ENGINE`; MuJoCo is part of the validator."""
 
 from __future__ import annotations
 
@@ -6,14 +8,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from itertools import combinations
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError, choices_text
 from graspd.service.model.transforms import Floats
+from graspd.service.store.columns import ENGINES
 from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext, evaluate_rows
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
@@ -28,9 +30,6 @@ from graspd.worker.validation.model import MujocoOptions, scene_of
 from graspd.worker.validation.protocol import Outcome, Rollout, Test
 from graspd.worker.validation.validator import validate
 
-#: Modules of engines in the order of the bits of `quality/held_in`; each has a constant `ENGINE`. MuJoCo is built in.
-ENGINES: Final = ("mujoco", "physx", "drake")
-
 
 @dataclass(frozen=True)
 class EngineVerdicts:
@@ -40,7 +39,7 @@ class EngineVerdicts:
     success: NDArray[np.int8]  # (N,) 1 held, 0 not
     reasons: tuple[str, ...]  # (N,) `held`, or the kind of the loss
     margin: Floats  # (N,) largest ratio of displacement or rotation to its limit
-    core_s: float  # seconds of all threads
+    core_s: float  # CPU time of this process
 
 
 def check_engines(names: Sequence[str]) -> tuple[str, ...]:
@@ -79,12 +78,12 @@ def validate_with_engine(
     `worker.validation.engines.trial`. Raises InputError: the engine is unknown, not installed, or cannot simulate the
     model; and the errors of `validate`."""
     (name,) = check_engines([name])
-    pieces = pieces or decompose(obj)
+    pieces, began = pieces or decompose(obj), time.process_time()
     if name == "mujoco":
         given: dict[str, Any] = {"level": level, "hard": hard, "pieces": pieces, "run": run}
         found = validate(hand, obj, grasps, **given) if placed is None else None
         done: Any = found or validate_lifts(hand, obj, grasps, placed, **given)  # type: ignore[arg-type]
-        return EngineVerdicts(name, done.success, tuple(done.reasons), done.margin, done.seconds * run.cores)
+        return EngineVerdicts(name, done.success, tuple(done.reasons), done.margin, time.process_time() - began)
     if placed is not None:
         require_approaches(grasps, placed, "lift")
         if placed.neighbours:
@@ -99,20 +98,21 @@ def validate_with_engine(
     def tests() -> tuple[Simulation, Test]:
         return engine.simulation(model), Test(scene) if placed is None else Lift(scene, placed)
 
-    def ask(pair: tuple[Simulation, Test], row: int) -> tuple[bool, str, float, float]:
+    def ask(pair: tuple[Simulation, Test], row: int) -> tuple[bool, str, float]:
         run.check("the validator")
-        (simulation, test), began = pair, time.thread_time()
+        simulation, test = pair
         reason, rollout = _geometry(test, grasps, row), Rollout()
         if not reason:
             rollout = run_trial(simulation, trial_of(scene, grasps, row, placed), obj.centre_of_mass)
             lost = [outcome for outcome in rollout.outcomes if outcome not in (Outcome.HELD, Outcome.NOT_TRIED)]
             reason = lost[0].name.lower().replace("_", " ") if lost else "held"
         done_rows.add(1)
-        return reason == "held", reason, rollout.margin, time.thread_time() - began
+        return reason == "held", reason, rollout.margin
 
     rows = evaluate_rows(range(len(grasps)), tests, ask, threads=run.cores, name=name)
-    held, reasons, margin, seconds = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return EngineVerdicts(name, np.array(held, np.int8), tuple(reasons), np.array(margin, float), sum(seconds))
+    held, reasons, margin = zip(*rows, strict=True) if rows else ((), (), ())
+    seconds = time.process_time() - began
+    return EngineVerdicts(name, np.array(held, np.int8), tuple(reasons), np.array(margin, float), seconds)
 
 
 def _geometry(test: Test, grasps: GraspSet, row: int) -> str:
@@ -123,46 +123,13 @@ def _geometry(test: Test, grasps: GraspSet, row: int) -> str:
     return "penetration" if test.set_up(grasps, row).outcomes[0] is Outcome.PENETRATION else ""
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """Agreement of two engines on the same grasps."""
-
-    engines: tuple[str, str]
-    counts: tuple[int, int, int, int]  # held in both, only in the first, only in the second, in none
-
-    @property
-    def share(self) -> float:
-        both, _, _, none = self.counts
-        return (both + none) / max(1, sum(self.counts))
-
-    @property
-    def kappa(self) -> float:
-        """Cohen's κ: agreement beyond chance (Cohen, "A coefficient of agreement for nominal scales", 1960).
-        nan if both engines give all grasps the same single verdict."""
-        both, first, second, _ = self.counts
-        n = max(1, sum(self.counts))
-        a, b = (both + first) / n, (both + second) / n
-        chance = a * b + (1 - a) * (1 - b)
-        return (self.share - chance) / (1 - chance) if chance < 1 else float("nan")
-
-
-def agreements(verdicts: Sequence[EngineVerdicts]) -> list[Agreement]:
-    """Return the agreement of each pair of engines."""
-    found = []
-    for one, two in combinations(verdicts, 2):
-        a, b = one.success == 1, two.success == 1
-        counts = [int(np.sum(x)) for x in (a & b, a & ~b, ~a & b, ~a & ~b)]
-        found.append(Agreement((one.engine, two.engine), tuple(counts)))  # type: ignore[arg-type]
-    return found
-
-
 def engine_columns(verdicts: Sequence[EngineVerdicts]) -> dict[str, NDArray[Any]]:
     """Return `quality/held_in` (N,), bits in the order of `ENGINES`, and `quality/agreement` (N,).
-    Agreement is the share of the engines that give the verdict of the majority: 1 if all agree."""
+    Agreement is the share of engines that give the verdict of the majority: 1 if all agree."""
     held = np.array([one.success for one in verdicts], bool)
     bits = np.array([1 << ENGINES.index(one.engine) for one in verdicts])
     share = held.mean(axis=0)
     return {
         "quality/held_in": (held * bits[:, None]).sum(axis=0).astype(np.uint8),
-        "quality/agreement": np.maximum(share, 1 - share).astype(np.float32),
+        "quality/agreement": np.maximum(share, 1 - share),
     }
