@@ -1,8 +1,8 @@
 """One protocol for all engines: closing to the squeeze, then six pushes, or a lift with its hold.
 
-DexGraspBench's published test without early ends: the hand closes, and each push of 2 s starts from the closed hand. In
-scenes the hand rises smoothly and holds for 2 s. Pregrasps that penetrate, and approaches that collide, are rejected by
-geometry alone, so equally for all engines."""
+DexGraspBench's published test with the early end of level standard: the hand closes, and each push of at most 2 s
+starts from the closed hand. In scenes the hand rises smoothly and holds. Pregrasps that penetrate, and approaches that
+collide, are rejected by geometry alone, so equally for all engines."""
 
 from __future__ import annotations
 
@@ -31,19 +31,21 @@ from graspd.worker.validation.engines.port import (
 from graspd.worker.validation.lift import RISING, RISING_S, SMOOTHLY
 from graspd.worker.validation.model import Scene, interpolate_postures
 from graspd.worker.validation.protocol import (
-    DEXGRASPBENCH_INTERVAL_S,
+    AHEAD,
     DIRECTIONS,
     HOLD_S,
+    INTERVAL_S,
     MAX_DISPLACEMENT_M,
     MAX_ROTATION,
     STAGE_S,
     STAGES,
+    SURE,
     Outcome,
     Rollout,
 )
 
 LIMITS: Final = MotionLimits(MAX_DISPLACEMENT_M, MAX_ROTATION)
-_COUNT: Final = round(HOLD_S / DEXGRASPBENCH_INTERVAL_S)
+_COUNT: Final = round(HOLD_S / INTERVAL_S)
 
 
 def engine_model(scene: Scene, pieces: ConvexPieces, supports: PlacedGrasps | None = None) -> EngineModel:
@@ -143,7 +145,7 @@ def trial_of(scene: Scene, grasps: GraspSet, row: int, placed: PlacedGrasps | No
     roots, targets = _targets(scene.hand, world, path)
     weight = scene.push_force * (np.zeros(3) if placed is None else -UP)
     closing = Motion(roots, targets, np.full(len(path), STAGE_S), weight, np.zeros((len(path), 3)))
-    hold = np.full(_COUNT, DEXGRASPBENCH_INTERVAL_S)
+    hold = np.full(_COUNT, INTERVAL_S)
     if placed is None:
         forces = scene.push_force * np.array(DIRECTIONS, float)
         tests = tuple(_rest(closing, np.zeros((_COUNT, 3)), hold, force) for force in forces)
@@ -191,29 +193,44 @@ class _Checks:
         self._start, self._place = trial.object_pose, self._position(trial.object_pose)
 
     def run(self, motion: Motion, *, last: bool = False) -> Outcome:
-        """Run a motion up to a loss; with `last`, check only its end."""
+        """Run a motion up to a loss or to its early end (see `protocol.AHEAD`); with `last`, check only its end."""
         parts = zip(motion.root, motion.joints, motion.seconds, motion.displacement, strict=True)
-        outcome = Outcome.HELD
+        changes = np.flatnonzero(np.diff(motion.displacement, axis=0).any(axis=1))
+        resting = int(changes[-1]) + 2 if len(changes) else 0  # first target through which the object should rest
+        left, outcome, before = float(motion.seconds.sum()), Outcome.HELD, np.zeros(4)
         for number, (root, joints, seconds, displacement) in enumerate(parts):
             self._rollout.steps += self._simulation.run(root, joints, motion.force, float(seconds))
+            left -= float(seconds)
             if last and number < len(motion.seconds) - 1:
                 continue
-            if (outcome := self._outcome(displacement)) is not Outcome.HELD:
+            moved = self._motion(displacement)
+            if (outcome := self._outcome(moved)) is not Outcome.HELD:
                 break
+            ahead = moved + AHEAD * left / float(seconds) * (moved - before)
+            if number > resting and _excess(ahead, self._limits) < SURE:
+                break
+            before = moved
         return outcome
 
     def _position(self, pose: Floats) -> Floats:
         return np.asarray(pose[:3] - quat_rotate(pose[3:], self._centre))
 
-    def _outcome(self, displacement: Floats) -> Outcome:
+    def _motion(self, displacement: Floats) -> Floats:
+        """Return the object's deviation (3,) from an expected displacement, and its rotation since the start."""
         pose = self._simulation.object_pose()
-        if not np.isfinite(pose).all():
-            return Outcome.DIVERGED
-        moved = float(np.linalg.norm(self._position(pose) - self._place - displacement))
         q = quat_multiply(pose[3:], quat_conjugate(self._start[3:]))
         turned = 2 * math.atan2(float(np.linalg.norm(q[1:])), abs(float(q[0])))
-        limits = self._limits
-        self._rollout.margin = max(self._rollout.margin, moved / limits.displacement_m, turned / limits.rotation)
-        if not moved < limits.displacement_m:
+        return np.append(self._position(pose) - self._place - displacement, turned)
+
+    def _outcome(self, moved: Floats) -> Outcome:
+        if not np.isfinite(moved).all():
+            return Outcome.DIVERGED
+        self._rollout.margin = max(self._rollout.margin, _excess(moved, self._limits))
+        if not np.linalg.norm(moved[:3]) < self._limits.displacement_m:
             return Outcome.DISPLACED
-        return Outcome.HELD if turned < limits.rotation else Outcome.ROTATED
+        return Outcome.HELD if moved[3] < self._limits.rotation else Outcome.ROTATED
+
+
+def _excess(moved: Floats, limits: MotionLimits) -> float:
+    """Return the larger ratio of displacement or rotation to its limit."""
+    return max(float(np.linalg.norm(moved[:3])) / limits.displacement_m, float(moved[3]) / limits.rotation)
