@@ -74,9 +74,9 @@ def validate_with_engine(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> EngineVerdicts:
     """Validate grasps in one engine: free ones by pushes, placed ones by lifts.
-    MuJoCo's verdicts are those of `validate` or `validate_lifts` at `level`; the other engines have one protocol,
-    `worker.validation.engines.trial`. Raises InputError: the engine is unknown, not installed, or cannot simulate the
-    model; and the errors of `validate`."""
+    MuJoCo's verdicts are those of `validate` or `validate_lifts` at `level`. The other engines have one protocol
+    (`worker.validation.engines.trial`), whose tests end early unless level is dexgraspbench. Raises InputError: the
+    engine is unknown, not installed, or cannot simulate the model; and the errors of `validate`."""
     (name,) = check_engines([name])
     pieces, began = pieces or decompose(obj), time.process_time()
     if name == "mujoco":
@@ -103,7 +103,9 @@ def validate_with_engine(
         simulation, test = pair
         reason, rollout = _geometry(test, grasps, row), Rollout()
         if not reason:
-            rollout = run_trial(simulation, trial_of(scene, grasps, row, placed), obj.centre_of_mass)
+            rollout = run_trial(
+                simulation, trial_of(scene, grasps, row, placed), obj.centre_of_mass, early=level != "dexgraspbench"
+            )
             lost = [outcome for outcome in rollout.outcomes if outcome not in (Outcome.HELD, Outcome.NOT_TRIED)]
             reason = lost[0].name.lower().replace("_", " ") if lost else "held"
         done_rows.add(1)
