@@ -23,6 +23,9 @@ TIMESTEP_S: Final = 0.004
 POSITION_ITERATIONS: Final = 16
 VELOCITY_ITERATIONS: Final = 1
 CONTACT_OFFSET_M: Final = 0.001
+#: Largest speed out of a penetration [m/s]: 3 mm in 15 ms, about the time constant of the validator's contacts in MuJoCo.
+#: Without this limit, a pregrasp that penetrates by some mm throws the object away.
+SEPARATION_M_S: Final = 0.2
 #: Stiffness of a coupling over its follower's damping [1/s]. PhysX's fixed tendons are no alternative: their reaction
 #: acts on the wrong joint. The explicit spring is stable up to 2 / `TIMESTEP_S` for couplings of ratio 1.
 COUPLING: Final = 200.0
@@ -248,6 +251,7 @@ def _set_mass(body: Any, mass: float, centre: Floats, inertia: Floats) -> None:
     body.mass = mass
     body.cmass_local_pose = _pose(np.concatenate([centre, quat_from_matrix(axes)]))
     body.inertia = moments
+    body.max_depenetration_velocity = SEPARATION_M_S
 
 
 def _set_joint(
