@@ -23,7 +23,7 @@ TIMESTEP_S: Final = 0.004
 POSITION_ITERATIONS: Final = 16
 VELOCITY_ITERATIONS: Final = 1
 CONTACT_OFFSET_M: Final = 0.001
-#: Largest speed out of a penetration [m/s]: 3 mm in 15 ms, about the time constant of the validator's contacts in MuJoCo.
+#: Largest speed out of a penetration [m/s]: 3 mm in 15 ms, about the time constant of contacts in MuJoCo.
 #: Without this limit, a pregrasp that penetrates by some mm throws the object away.
 SEPARATION_M_S: Final = 0.2
 #: Stiffness of a coupling over its follower's damping [1/s]. PhysX's fixed tendons are no alternative: their reaction
