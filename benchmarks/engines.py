@@ -28,9 +28,9 @@ HEAD: Final = """# Engines
 
 `python -m benchmarks.engines DATA`: verdicts of several engines on the same candidates, which no validation selected.
 {grasps} candidates per hand, object and kind of scene; objects: {listed}; seed {seed}. *Half*: half the friction.
-*Both*, *only first*, *only second*: numbers of grasps that hold. κ: agreement beyond chance (Cohen). *First held: second
-holds*: share of the first engine's grasps that the second engine holds. Core-ms are CPU time per verdict on a busy
-machine.
+*Both*, *only first*, *only second*: numbers of grasps that hold. κ: agreement beyond chance (Cohen). *First held:
+second holds*: share of the first engine's grasps that the second engine holds. Core-ms are CPU time per verdict on a
+busy machine.
 
 """
 

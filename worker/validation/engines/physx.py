@@ -26,9 +26,10 @@ CONTACT_OFFSET_M: Final = 0.001
 #: Largest speed out of a penetration [m/s]: 3 mm in 15 ms, about the time constant of contacts in MuJoCo.
 #: Without this limit, a pregrasp that penetrates by some mm throws the object away.
 SEPARATION_M_S: Final = 0.2
-#: Stiffness of a coupling over its follower's damping [1/s]. PhysX's fixed tendons are no alternative: their reaction
-#: acts on the wrong joint. The explicit spring is stable up to 2 / `TIMESTEP_S` for couplings of ratio 1.
-COUPLING: Final = 200.0
+#: Stiffness of a coupling over its joints' damping [1/s], divided by 1 + the sum of the squared ratios of its leader.
+#: The explicit spring was unstable at twice this value. PhysX's fixed tendons are no alternative: their reaction acts
+#: on the wrong joint.
+COUPLING: Final = 2000.0
 #: Least inertia of a joint over its damping [s]; lighter joints converge slowly. Forces at rest do not depend on it.
 ARMATURE_S: Final = 0.01
 _GROUPS: Final = 32  # bits of a shape's filter
@@ -75,7 +76,9 @@ class PhysxSimulation:
         for row, coupling in enumerate(model.couplings, len(model.drives)):
             pulls[row, column[coupling.follower]], pulls[row, column[coupling.leader]] = 1.0, -coupling.ratio
         self._pulls = pulls
-        stiff = [COUPLING * model.links[one.follower].damping for one in model.couplings]
+        squares = [sum(two.ratio**2 for two in model.couplings if two.leader == one.leader) for one in model.couplings]
+        damping = [model.links[one.follower].damping for one in model.couplings]
+        stiff = [COUPLING * d / (1 + square) for d, square in zip(damping, squares, strict=True)]
         self._gain = np.array([*(drive.gain for drive in model.drives), *stiff])
         self._effort = np.array([*(drive.effort for drive in model.drives), *([np.inf] * len(stiff))])
 

@@ -9,6 +9,7 @@ from graspd.service.model.errors import InputError
 from graspd.studies.engines import summarise
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.model import HandModel
 from graspd.worker.validation.engines import registry
 from graspd.worker.validation.engines.registry import (
     ENGINES,
@@ -17,6 +18,7 @@ from graspd.worker.validation.engines.registry import (
     engine_columns,
     validate_with_engine,
 )
+from tests.worker.models import on_one_dof
 from tests.worker.quality.helpers import BOX, PADS, WHOLE, posture
 from tests.worker.validation.test_lift import BOX as STANDING
 from tests.worker.validation.test_lift import HAND, PLACED, grasp
@@ -35,20 +37,24 @@ def engine(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def pinch(engine: str, *, mass: float = 0.05, friction: float = FRICTION, force: float = FORCE) -> EngineVerdicts:
-    """Two opposite pads on the middle of a box, each with a normal force [N]."""
+def pinch(
+    engine: str, *, mass: float = 0.05, friction: float = FRICTION, force: float = FORCE, hand: HandModel = PADS
+) -> EngineVerdicts:
+    """Two opposite pads on the middle of a box, each with a normal force [N]; a drive of both has twice the force."""
+    shift = len(hand.joint_names) / hand.dofs * force / hand.stiffness[0]
     contact, open_hand = posture(((0, 0, 0), (0.065, 0.065))), posture(((0, 0, 0), (0.055, 0.055)))
-    pressed = posture(((0, 0, 0), (0.065 + force / PADS.stiffness[0],) * 2))
+    pressed = posture(((0, 0, 0), (0.065 + shift,) * 2))
     grasps = GraspSet(contact, open_hand, pressed, np.full(1, np.nan))
     obj, run = BOX.with_mass(mass=mass, friction=friction), ExecutionContext(threads=1)
-    return validate_with_engine(engine, PADS, obj, grasps, level="dexgraspbench", pieces=WHOLE, run=run)
+    return validate_with_engine(engine, hand, obj, grasps, level="dexgraspbench", pieces=WHOLE, run=run)
 
 
-def test_a_pinch_holds_95_percent_of_its_weight_and_drops_105_percent(engine: str) -> None:
+@pytest.mark.parametrize("hand", [PADS, on_one_dof(PADS)], ids=["two drives", "one drive of both"])
+def test_a_pinch_holds_95_percent_of_its_weight_and_drops_105_percent(engine: str, hand: HandModel) -> None:
     limit = 2 * FRICTION * FORCE / GRAVITY
-    assert pinch(engine, mass=0.95 * limit).reasons == ("held",)
+    assert pinch(engine, mass=0.95 * limit, hand=hand).reasons == ("held",)
     # At 1.05 of its weight the box accelerates by 0.48 m/s^2: 95 cm within a push, of which 5 cm are a loss.
-    assert pinch(engine, mass=1.05 * limit).success.tolist() == [0]
+    assert pinch(engine, mass=1.05 * limit, hand=hand).success.tolist() == [0]
 
 
 def test_without_squeeze_the_box_drops(engine: str) -> None:
