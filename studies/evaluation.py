@@ -108,7 +108,7 @@ def evaluate(
                 one |= {"held_foreign": bool(held), "reason_foreign": reason}
     elif protocol == "lift" and case.placed is not None:
         common |= {"placed": case.placed, "level": level}
-        grasps, clear = _with_trajectories(case, case.placed)
+        grasps, clear = with_trajectories(case, case.placed)
         lifts = validate_lifts(case.hand, case.obj, grasps, **common)
         row |= _lift_rates(lifts, clear)
         if models:
@@ -178,7 +178,8 @@ def _success(case: Case, verdicts: Verdicts) -> dict[str, Any]:
     return row
 
 
-def _with_trajectories(case: Case, placed: PlacedGrasps) -> tuple[GraspSet, NDArray[np.bool_]]:
+def with_trajectories(case: Case, placed: PlacedGrasps) -> tuple[GraspSet, NDArray[np.bool_]]:
+    """Return the grasps with their approaches and lifts, and whether each trajectory (N,) is clear."""
     way, grasps = plan_trajectory(case.hand, case.obj, case.grasps, placed), case.grasps
     if grasps.approach is None or grasps.coming is None:
         # Imported files rarely have trajectories.

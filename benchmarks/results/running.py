@@ -23,7 +23,7 @@ from typing import Final
 from PIL import Image, ImageChops, ImageStat
 
 from benchmarks.results.manifest import REPOSITORY, digests, load, revision_of_today, save, staleness, write
-from benchmarks.results.studies import BROWSER, GPU, PREFILTER, SERVICE, TORCH, Study, files_of, is_raw
+from benchmarks.results.studies import BROWSER, ENGINES, GPU, PREFILTER, SERVICE, TORCH, Study, files_of, is_raw
 from graspd.service.model.cores import available_cores
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.run.supervisor import Supervisor
@@ -166,6 +166,7 @@ class Runner:
             SERVICE: lambda: True,
             BROWSER: lambda: bool(shutil.which("chromium")) and importlib.util.find_spec("playwright") is not None,
             PREFILTER: lambda: importlib.util.find_spec("mujoco_warp") is not None,
+            ENGINES: lambda: all(importlib.util.find_spec(name) is not None for name in ("sapien", "pydrake")),
             TORCH: lambda: importlib.util.find_spec("torch") is not None,
             GPU: lambda: bool(shutil.which("nvidia-smi")) and not self.quick,
         }

@@ -15,6 +15,7 @@ IN_SCENES: Final = ("synthesize", "scene")
 ALL: Final = ("synthesize", "scene", "render")
 #: Requirements of studies besides DATA, SOURCES and BEFORE.
 SERVICE, BROWSER, GPU, TORCH, PREFILTER = "a service", "a browser", "a GPU", "PyTorch", "mujoco-warp"
+ENGINES: Final = "sapien and drake"
 #: Suffixes of raw results. Raw results are not in git.
 RAW: Final = frozenset({".json", ".csv", ".svg", ".sha256"})
 #: Files with such a suffix that are in git, because they are written by hand.
@@ -201,6 +202,19 @@ STUDIES: Final = (
         (f"python -m benchmarks.prefilter DATA --work WORK/cells {_LITTLE} --out OUT/results/prefilter",),
         seeds=(7001,),
         needs=(PREFILTER,),
+    ),
+    Study(
+        "engines",
+        "verdicts of several engines on the same candidates",
+        ("results/engines.md",),
+        ("python -m benchmarks.engines DATA --grasps 8 --engines mujoco,physx,drake --page OUT/results/engines.md",),
+        (
+            "python -m benchmarks.engines DATA --hands barrett --objects 077_rubiks_cube --grasps 2 "
+            "--engines mujoco,physx,drake --page OUT/results/engines.md",
+        ),
+        IN_SCENES,
+        seeds=(1500,),
+        needs=(ENGINES,),
     ),
     Study(
         "robust",

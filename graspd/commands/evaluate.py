@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -16,11 +17,13 @@ from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
 from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
 from graspd.service.store.shards import inherited_attributes, json_attribute, read_shard, write_shard
+from graspd.studies.engines import compare_engines, summarise
 from graspd.studies.evaluation import checked_level, combine_rows, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.subsets import require_empty_folder
 from graspd.worker.hands.hand_matching import TOLERANCE_M, match_hands
 from graspd.worker.hands.load import hand_from_path
+from graspd.worker.validation.engines.registry import EngineVerdicts, check_engines, engine_columns
 from graspd.worker.validation.robust import Robustness
 
 app = CommandGroup(add_completion=False)
@@ -53,7 +56,12 @@ def evaluate_command(
     validation_tolerance: Annotated[
         float, typer.Option(min=0.0, help="Maximum distance between fingertips of the two models [mm].")
     ] = 1e3 * TOLERANCE_M,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="With --robust: copy with robust shares.")] = None,
+    engines: Annotated[
+        str, typer.Option("--engines", "--engine", help="Engines to compare: mujoco, physx, drake; commas between.")
+    ] = "",
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="With --robust or --engines: copy with their columns.")
+    ] = None,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
     json: JsonFlag = False,
 ) -> None:
@@ -67,9 +75,13 @@ def evaluate_command(
         raise InputError(f"--validation-hand validates by protocol dexgraspbench, not by {protocol}")
     other = None if validation_hand is None else hand_from_path(validation_hand, drag=True)
     twins = _joint_map(joint_map)
+    several = check_engines([one.strip() for one in engines.split(",")]) if engines else ()
+    if several and (robust or validation_hand or protocol == "displacement"):
+        raise InputError("--engines compares verdicts on pushes or lifts alone, without --robust or --validation-hand")
     listed = [one for path in files for one in expand_path(path)]
-    copies = _copy_paths(files, listed, out, robust=robust, hard=hard)
+    copies = _copy_paths(files, listed, out, columns=bool(robust or several), hard=hard)
     rows: list[dict[str, Any]] = []
+    verdicts: dict[str, list[EngineVerdicts]] = {}
     name, done = TextColumn("{task.description}", markup=False), TextColumn("{task.completed:.0f}/{task.total:.0f}")
     columns = (name, BarColumn(), done, TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
@@ -79,6 +91,15 @@ def evaluate_command(
             if copies and (case.placed is None) == (protocol == "lift"):
                 needed = "--protocol lift for grasps in scenes, or dexgraspbench for free grasps"
                 raise InputError(f"{file}: -o needs {needed}")
+            run = ExecutionContext(threads=threads, progress=partial(_update_bar, bar, task, case.name))
+            if several:
+                if protocol == "lift" and case.placed is None:
+                    raise InputError(f"{file} has free grasps, but a lift test needs a scene: graspd synth --scene")
+                found = compare_engines(case, several, lift=protocol == "lift", level=level, hard=hard, run=run)
+                verdicts[str(file)] = found
+                if copies:
+                    write_copy(file, copies[file], engine_columns(found), {"engines": ",".join(several)})
+                continue
             tolerance_m = validation_tolerance / 1e3
             twin = None if other is None else match_hands(case.hand, other, twins, tolerance_m=tolerance_m)
             row = evaluate(
@@ -89,10 +110,13 @@ def evaluate_command(
                 friction=friction,
                 models=robust,
                 validation_hand=twin,
-                tell=partial(write_copy, file, copies[file]) if copies else lambda found: None,
-                run=ExecutionContext(threads=threads, progress=partial(_update_bar, bar, task, case.name)),
+                tell=partial(_write_robust, file, copies[file]) if copies else lambda found: None,
+                run=run,
             )
             rows.append({"file": str(file), **row})
+    if several:
+        _report_engines(verdicts, json=json)
+        return
     _report(rows, other.name if other else "", json=json)
 
 
@@ -113,13 +137,15 @@ def _report(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
                 typer.echo(row["note"], err=True)
 
 
-def _copy_paths(paths: list[Path], files: list[Path], out: Path | None, *, robust: int, hard: bool) -> dict[Path, Path]:
+def _copy_paths(
+    paths: list[Path], files: list[Path], out: Path | None, *, columns: bool, hard: bool
+) -> dict[Path, Path]:
     if out is None:
         return {}
-    if not robust or hard or len(paths) != 1:
-        raise InputError("-o needs --robust N, no --hard, and one file or folder")
+    if not columns or hard or len(paths) != 1:
+        raise InputError("-o needs --robust N or --engines, no --hard, and one file or folder")
     if other := next((file for file in files if file.suffix != ".h5"), None):
-        raise InputError(f"{other} is no shard of graspd: only shards can store the shares")
+        raise InputError(f"{other} is no shard of graspd: only shards can store the results")
     if paths[0].is_dir():
         require_empty_folder(out)
         return {file: out / file.relative_to(paths[0]) for file in files}
@@ -188,13 +214,53 @@ def _cell_text(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def write_copy(source: Path, out: Path, found: Robustness) -> None:
-    """Write a base shard with the robust shares of its grasps; all else, including its id, is unchanged."""
-    shard = read_shard(source, kind="base")
+def _write_robust(source: Path, out: Path, found: Robustness) -> None:
     said = json_attribute({"models": found.held.shape[1], "wanted": found.wanted})
-    data = write_shard("base", {**shard.arrays, **found.columns}, {**inherited_attributes(shard), "robust": said})
+    write_copy(source, out, found.columns, {"robust": said})
+
+
+def write_copy(source: Path, out: Path, columns: Mapping[str, Any], attributes: Mapping[str, str]) -> None:
+    """Write a base shard with further columns and attributes; all else, including its id, is unchanged."""
+    shard = read_shard(source, kind="base")
+    data = write_shard("base", {**shard.arrays, **columns}, {**inherited_attributes(shard), **attributes})
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_output(out, data)
     except OSError as error:
         raise InputError(f"{out} cannot be written: {error.strerror}") from None
+
+
+def _report_engines(verdicts: dict[str, list[EngineVerdicts]], *, json: bool) -> None:
+    whole = summarise(list(verdicts.values()))
+    names = list(whole["success"])
+    if json:
+        files = [
+            {
+                "file": file,
+                **summarise([found]),
+                "held": {one.engine: one.success.tolist() for one in found},
+                "reasons": {one.engine: one.reasons for one in found},
+            }
+            for file, found in verdicts.items()
+        ]
+        print_json(whole | {"files": files})
+        return
+    title = "share of grasps that holds in each engine"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("grasps", max_width=40, overflow="fold")
+    for heading in ("n", *names):
+        table.add_column(heading, justify="right", no_wrap=True)
+    lines = {Path(file).stem: summarise([found]) for file, found in verdicts.items()} | {"all": whole}
+    for name, row in lines.items():
+        if name != "all" or len(verdicts) > 1:
+            table.add_row(name, str(row["n"]), *(f"{row['success'][one]:.2f}" for one in names))
+    plain_console().print(table)
+    for pair in whole["pairs"]:
+        (a, b), (x, y) = pair["engines"], pair["only"]
+        typer.echo(
+            f"{a} and {b}: agreement {pair['agreement']:.2f}, κ {_cell_text(pair['kappa'], 2)}; "
+            f"held by both {pair['both']}, only by {a} {x}, only by {b} {y}"
+        )
+        for reason, count in pair["differences"].items():
+            typer.echo(f"  {count} {reason}")
+    typer.echo("core-ms per verdict: " + ", ".join(f"{one} {whole['core_ms'][one]:.0f}" for one in names))

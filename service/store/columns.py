@@ -68,6 +68,10 @@ PUSH_OUTCOMES: Final = dict(
 _LIFT_OUTCOMES = ("not tested", "lifted", "penetration", "contact on the approach", "lost while closing", "not lifted")
 LIFT_OUTCOMES: Final = dict(enumerate((*_LIFT_OUTCOMES, "rotated", "diverged", "neighbour moved")))
 
+#: Engines of validation, in the order of their bits in `quality/held_in`.
+ENGINES: Final = ("mujoco", "physx", "drake")
+_BITS: Final = ", ".join(f"{1 << bit} {name}" for bit, name in enumerate(ENGINES))
+
 
 def _wrist_column(rows: str) -> Column:
     description = "collision-free angles of wrist joints above the hand's root, order in attribute wrist_joint_names"
@@ -104,6 +108,10 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         **_metric_columns(optional=True),
         "quality/robust_weakest": _code_column(
             "perturbed parameter of the first model in which the grasp does not hold: 0 none, ", outcomes=AXIS_MEANINGS
+        ),
+        "quality/held_in": _code_column(f"sum of the codes of the engines that hold the grasp: {_BITS}"),
+        "quality/agreement": _optional_column(
+            "N", "f8", "1", "none", "share of the engines that give the verdict of the majority"
         ),
         # Grasps planned in scenes also have the scene, the approach and the lift.
         "scene/object_pose": _optional_column("S 7", "f8", "m, 1", "scene", "object frame at rest; z points up"),
@@ -218,6 +226,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "grasps_wanted": RootAttribute("integer", "number of requested grasps, if the command was interrupted", _BASE),
     "requirements": RootAttribute("text", "JSON: required type, digits, region and approach; absent: none", _BASE),
     "robust": RootAttribute("text", "JSON: perturbed models per valid grasp, required share; absent: none", _BASE),
+    "engines": RootAttribute("text", "engines of `quality/held_in`, separated by commas; absent: none", _BASE),
     "verdict_level": RootAttribute("text", "level of validation; `none`: not validated", _BASE),
     "verdict_key": RootAttribute("text", "digest of all settings that affect verdicts; average only equal keys", _BASE),
     "scene": RootAttribute("text", "scene of the grasps, as JSON; absent: planned around a free object"),

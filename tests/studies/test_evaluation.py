@@ -24,7 +24,7 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.transforms import apply, invert
-from graspd.service.store.shards import write_shard
+from graspd.service.store.shards import read_shard, write_shard
 from graspd.studies.bench import clock_of, kernel_shares, measure_host_ms
 from graspd.studies.evaluation import combine_rows, evaluate
 from graspd.worker.control.postures import pregrasp, squeeze
@@ -144,6 +144,20 @@ def test_the_command_prints_json_or_a_table(shared_data) -> None:
     assert "056_tennis_ball" in done.stdout and "not validated" in done.stdout
 
 
+def test_engines_are_compared_and_a_copy_has_their_columns(tmp_path) -> None:
+    made, copy = tmp_path / "g.h5", tmp_path / "copy.h5"
+    graspd("synth --hand barrett --object block --fidelity draft -n 2 --want candidates -o", made)
+    found = graspd("evaluate --engine mujoco -o", copy, made)
+    held = read_shard(made, kind="base").arrays["quality/success"]
+    assert found["files"][0]["held"] == {"mujoco": held.tolist()} and found["pairs"] == []
+    assert found["success"] == {"mujoco": pytest.approx(held.mean(), abs=1e-4)}
+    shard = read_shard(copy, kind="base")
+    assert shard.arrays["quality/held_in"].tolist() == held.tolist() and shard.attributes["engines"] == "mujoco"
+    assert (shard.arrays["quality/agreement"] == 1).all()
+    done = CliRunner().invoke(app, [str(made), "--engines", "mujoco"])
+    assert done.exit_code == 0 and re.search(rf"g +2 +{held.mean():.2f}", done.stdout), done.output
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -154,6 +168,8 @@ def test_the_command_prints_json_or_a_table(shared_data) -> None:
         ("--validation-hand shadow --protocol lift", "validates by protocol dexgraspbench"),
         ("--level quick", "unknown"),
         ("--protocol throw", "unknown"),
+        ("--engines mujoco,havok", "unknown engine 'havok'"),
+        ("--engine mujoco --robust 8", "without --robust"),
     ],
 )
 def test_another_model_is_asked_for_in_full(options: str, says: str) -> None:

@@ -87,10 +87,7 @@ class Lift(Test):
     def lift(self, grasps: GraspSet, row: int) -> LiftResult:
         """Run the test from the standoff to the end of the hold, along `grasps.approach`."""
         self._in_hand = True
-        if (rollout := self._set_up_scene(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
-            return rollout
-        if self._collides_on_approach(grasps, row):
-            rollout.outcome = LiftOutcome.TOUCHED_ON_THE_WAY
+        if (rollout := self.check_approach(grasps, row)).outcome is not LiftOutcome.NOT_TRIED:
             return rollout
         if not self._close(grasps, row, give_up=True):
             rollout.outcome = LiftOutcome.DIVERGED if is_invalid(self.data) else LiftOutcome.LOST_WHILE_CLOSING
@@ -102,6 +99,13 @@ class Lift(Test):
         rollout = self._complete_result(rollout, outcome)
         if rollout.success and self._neighbours_moved():
             rollout.outcome = LiftOutcome.NEIGHBOUR_MOVED
+        return rollout
+
+    def check_approach(self, grasps: GraspSet, row: int) -> LiftResult:
+        """Set up the grasp's scene; the outcome is NOT_TRIED if pregrasp and approach are free of contact."""
+        rollout = self._set_up_scene(grasps, row)
+        if rollout.outcome is LiftOutcome.NOT_TRIED and self._collides_on_approach(grasps, row):
+            rollout.outcome = LiftOutcome.TOUCHED_ON_THE_WAY
         return rollout
 
     def _set_up_scene(self, grasps: GraspSet, row: int) -> LiftResult:

@@ -134,7 +134,7 @@ class PushPayload(_WeightTest):
     def payload(self, grasps: GraspSet, row: int) -> float:
         """Return the payload [kg]; nan if the grasp does not hold the object under the pushes."""
         self._set_mass(self._own)
-        if self._set_up_test(grasps, row).outcomes[0] is Outcome.PENETRATION:
+        if self.set_up(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return math.nan
         if not self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) or is_invalid(self.data):
             return math.nan

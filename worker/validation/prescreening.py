@@ -101,7 +101,7 @@ class ShortPushTest(Test):
         """Return the largest ratio of motion to its limit in pushes at half friction; below 1 if held.
         Otherwise return the ratio at full friction plus `SLIPS`, or inf as soon as the score cannot be below `beat`."""
         self.scene = self._half
-        if self._set_up_test(grasps, row).outcomes[0] is Outcome.PENETRATION:
+        if self.set_up(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return DEEP
         if not self._close(grasps, row, give_up=True, stages=FREE_CLOSING) or is_invalid(self.data):
             return LOST

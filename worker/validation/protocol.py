@@ -96,7 +96,7 @@ class Test:
 
     def dexgraspbench(self, grasps: GraspSet, row: int) -> Rollout:
         """Run the protocol as published, up to the first push that fails."""
-        rollout = self._set_up_test(grasps, row)
+        rollout = self.set_up(grasps, row)
         if rollout.outcomes[0] is Outcome.PENETRATION:
             return rollout
         self._close(grasps, row)
@@ -104,7 +104,7 @@ class Test:
 
     def standard(self, grasps: GraspSet, row: int) -> Rollout:
         """Close once, start every push from that state, and end each push as soon as it is decided."""
-        rollout = self._set_up_test(grasps, row)
+        rollout = self.set_up(grasps, row)
         if rollout.outcomes[0] is Outcome.PENETRATION:
             return rollout
         if not self._close(grasps, row, give_up=True) or self._validate(rollout) is not Outcome.HELD:
@@ -127,7 +127,8 @@ class Test:
         rollout.steps = self._steps
         return rollout
 
-    def _set_up_test(self, grasps: GraspSet, row: int) -> Rollout:
+    def set_up(self, grasps: GraspSet, row: int) -> Rollout:
+        """Set up the grasp's pregrasp; the outcome is PENETRATION if it is too deep."""
         self._steps = 0
         rollout = Rollout()
         rollout.penetration_m, rollout.self_penetration_m = self._depths(grasps.grasp, row)

@@ -288,7 +288,7 @@ def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(level: str, tmp_p
     assert rollout.outcomes[0] is Outcome.DIVERGED and not rollout.success
     # What the guard is for: after MuJoCo's reset the object stands where it began.
     assert test._object_motion()[0] < 0.05 and is_invalid(test.data)
-    test._set_up_test(grasp_of(), 0)
+    test.set_up(grasp_of(), 0)
     assert not is_invalid(test.data)
     assert list(tmp_path.iterdir()) == [], "MuJoCo's warnings go to no file"
 

@@ -1,0 +1,99 @@
+"""What every installed engine must say of two pads and a box: the physics are known in closed form."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from graspd.service.model.errors import InputError
+from graspd.studies.engines import summarise
+from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.model import HandModel
+from graspd.worker.validation.engines import registry
+from graspd.worker.validation.engines.registry import (
+    ENGINES,
+    EngineVerdicts,
+    check_engines,
+    engine_columns,
+    validate_with_engine,
+)
+from tests.worker.models import on_one_dof
+from tests.worker.quality.helpers import BOX, PADS, WHOLE, posture
+from tests.worker.validation.test_lift import BOX as STANDING
+from tests.worker.validation.test_lift import HAND, PLACED, grasp
+
+GRAVITY = 10.0  # [m/s^2], of the protocol
+FORCE = 1.0  # of each pad [N]: so small that pushes along the pads' normals move their soft drives by 1 cm
+FRICTION = 0.6
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request: pytest.FixtureRequest) -> str:
+    try:
+        check_engines([request.param])
+    except InputError as missing:
+        pytest.skip(str(missing))
+    return str(request.param)
+
+
+def pinch(
+    engine: str, *, mass: float = 0.05, friction: float = FRICTION, force: float = FORCE, hand: HandModel = PADS
+) -> EngineVerdicts:
+    """Two opposite pads on the middle of a box, each with a normal force [N]; a drive of both has twice the force."""
+    shift = len(hand.joint_names) / hand.dofs * force / hand.stiffness[0]
+    contact, open_hand = posture(((0, 0, 0), (0.065, 0.065))), posture(((0, 0, 0), (0.055, 0.055)))
+    pressed = posture(((0, 0, 0), (0.065 + shift,) * 2))
+    grasps = GraspSet(contact, open_hand, pressed, np.full(1, np.nan))
+    obj, run = BOX.with_mass(mass=mass, friction=friction), ExecutionContext(threads=1)
+    return validate_with_engine(engine, hand, obj, grasps, level="dexgraspbench", pieces=WHOLE, run=run)
+
+
+@pytest.mark.parametrize("hand", [PADS, on_one_dof(PADS)], ids=["two drives", "one drive of both"])
+def test_a_pinch_holds_95_percent_of_its_weight_and_drops_105_percent(engine: str, hand: HandModel) -> None:
+    limit = 2 * FRICTION * FORCE / GRAVITY
+    assert pinch(engine, mass=0.95 * limit, hand=hand).reasons == ("held",)
+    # At 1.05 of its weight the box accelerates by 0.48 m/s^2: 95 cm within a push, of which 5 cm are a loss.
+    assert pinch(engine, mass=1.05 * limit, hand=hand).success.tolist() == [0]
+
+
+def test_without_squeeze_the_box_drops(engine: str) -> None:
+    assert pinch(engine, force=0.0).success.tolist() == [0]
+
+
+def test_without_friction_the_box_drops_and_glue_holds_it(engine: str) -> None:
+    assert pinch(engine, friction=1e-6).success.tolist() == [0]
+    # A third more than the pinch holds at friction 0.6, and too little to push the box off a pad.
+    assert pinch(engine, mass=0.16).success.tolist() == [0]
+    assert pinch(engine, mass=0.16, friction=50.0).reasons == ("held",)
+
+
+def test_a_firm_squeeze_lifts_the_box_from_a_table_and_none_leaves_it(engine: str) -> None:
+    given = {"level": "lift", "pieces": WHOLE, "run": ExecutionContext(threads=1)}
+    firm, none = (validate_with_engine(engine, HAND, STANDING, grasp(d), PLACED, **given) for d in (0.05, -0.005))
+    assert firm.success.tolist() == [1] and firm.margin[0] < 0.5
+    assert none.reasons[0] in ("displaced", "not lifted")
+
+
+def test_each_engine_says_what_it_holds_and_all_how_far_they_agree() -> None:
+    verdicts = [
+        EngineVerdicts(name, np.array(held, np.int8), ("held",) * 4, np.zeros(4), 1.0)
+        for name, held in (("mujoco", [1, 1, 1, 0]), ("physx", [1, 1, 0, 0]), ("drake", [1, 0, 0, 1]))
+    ]
+    columns = engine_columns(verdicts)
+    assert columns["quality/held_in"].tolist() == [7, 3, 1, 4]
+    assert columns["quality/agreement"] == pytest.approx([1, 2 / 3, 2 / 3, 2 / 3])
+    found = summarise([verdicts[:2], verdicts[:2]])
+    assert found["success"] == {"mujoco": 0.75, "physx": 0.5} and found["core_ms"]["physx"] == 250.0  # 2 s for 8 grasps
+    # Of 4 grasps 3 get equal verdicts; chance gives 3/4 * 1/2 + 1/4 * 1/2 = 1/2.
+    assert found["pairs"][0]["agreement"] == 0.75 and found["pairs"][0]["kappa"] == 0.5
+    assert found["pairs"][0]["only"] == [2, 0]
+
+
+def test_an_engine_that_is_not_there_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "sapien", None)
+    monkeypatch.delitem(sys.modules, f"{registry.__package__}.physx", raising=False)
+    with pytest.raises(InputError, match=r"engine physx needs sapien; run pip install 'graspd\[physx\]'"):
+        check_engines(["physx"])
+    with pytest.raises(InputError, match="unknown engine 'havok'"):
+        check_engines(["mujoco", "havok"])
