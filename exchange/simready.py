@@ -36,6 +36,8 @@ from graspd.worker.rendering.sheets import best_rows, metric_at_threshold
 BEYOND_M: Final = 0.005
 #: Contacts of one grasp that are tried as the ends of its line.
 _TRIED: Final = 64
+#: Distances from a mean contact at which the surface is searched [m].
+_STEPS: Final = np.arange(0.0, 0.1, 5e-4)
 _WIDTH_M: Final = 0.002
 _COLOUR: Final = (0.1, 0.6, 0.2)
 _TOLD: Final = ("shard_id", "method", "verdict_level", "code_version", "created", "seed", "root_link", "mu")
@@ -45,7 +47,8 @@ def closing_lines(case: Case, grasp: Posture) -> Floats:
     """Return the line (N, 2, 3) along which the hand closes in each grasp: object frame [m]; nan without contacts.
     It joins the mean contacts of two opposing sides and ends `BEYOND_M` outside the object. The sides face along the
     line between the two contacts whose normals are closest to it."""
-    found = probe_of(case.hand, case.obj, hand_points=HAND_POINTS, object_points=64).nearest_points(grasp)
+    probe = probe_of(case.hand, case.obj, hand_points=HAND_POINTS, object_points=64)
+    found = probe.nearest_points(grasp)
     near, lines = np.abs(found.distance) < LINK_CONTACT_M, np.full((len(grasp), 2, 3), np.nan)
     for row, mask in enumerate(near):
         place, normal = found.closest[row, mask], found.normal[row, mask]
@@ -57,8 +60,12 @@ def closing_lines(case: Case, grasp: Posture) -> Floats:
         if facing.size and facing.max() >= -FACING_COS:
             axis = between[np.unravel_index(int(np.argmax(facing)), facing.shape)]
             along = normal @ axis
-            ends = np.stack([place[along < FACING_COS].mean(axis=0), place[along > -FACING_COS].mean(axis=0)])
-            lines[row] = ends + BEYOND_M * np.array([[-1.0], [1.0]]) * axis
+            for end, side in enumerate((along < FACING_COS, along > -FACING_COS)):
+                outward = axis if end else -axis
+                # The mean contact of a curved side lies inside the object.
+                points = place[side].mean(axis=0) + _STEPS[:, None] * outward
+                outside = probe.signed_distance(points)[0] > 0
+                lines[row, end] = points[int(np.argmax(outside))] + BEYOND_M * outward
     return lines
 
 

@@ -30,18 +30,20 @@ def layer_files(path: Path) -> dict[str, Path]:
 
 def open_layers(root: Path, main: str) -> dict[str, Any]:
     """Open `main` and the layers that it refers to, by name relative to the folder `root`, without composing them.
-    Raises InputError: a layer is unreadable, or names another one that is missing or outside the folder."""
+    Missing layers are left out: the variant that needs them may not be selected.
+    Raises InputError: a layer is unreadable, or names one outside the folder."""
     from pxr import Sdf, Tf
 
     found: dict[str, Any] = {}
     waiting = [main]
     while waiting:
-        if (name := waiting.pop()) in found:
+        if (name := waiting.pop()) in found or (name != main and not (root / name).is_file()):
             continue
         try:
             layer = Sdf.Layer.FindOrOpen(str(root / name))
         except Tf.ErrorException as error:
-            raise InputError(f"{name}: {usd_reason(error, root)}") from None
+            # The reason begins with the name and the line, if the layer is a text.
+            raise InputError(f"{name}: {usd_reason(error, root).removeprefix(f'{name}:')}") from None
         if layer is None or len(found) == MAX_FILES:
             raise InputError(f"{name}: no readable USD layer, or one of more than {MAX_FILES}; export it again")
         found[name] = layer
@@ -59,8 +61,6 @@ def _resolve(root: Path, layer: str, reference: str) -> str:
         why = "outside its folder; give the folder that holds both as a ZIP"
     elif not name.lower().endswith(SUFFIXES[:3]):
         why = "which is no USD layer"
-    elif not (root / name).is_file():
-        why = "which is missing; add the file"
     else:
         return name
     raise InputError(f"{layer}: refers to {reference[:100]!r}, {why}, or flatten the stage: usdcat --flatten")
