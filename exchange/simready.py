@@ -218,6 +218,8 @@ class _Asset:
         written.notes.append(f"physics material of friction {case.obj.friction:g} added")
 
     def write(self, out: Path) -> None:
+        # The stage would look for the layers at their new paths.
+        self.stage = self.root = self.scope = None
         folder = out.resolve().parent
         folder.mkdir(parents=True, exist_ok=True)
         UsdUtils.ModifyAssetPaths(

@@ -17,7 +17,7 @@ from tests.exchange.robots.conftest import COMMON
 from tests.worker.commands_run import graspd, refused
 
 pytest.importorskip("pxr", reason="needs the extra usd")
-from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
+from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
 BLOCK = next(Path(service.__file__).parent.glob("builtin/objects/block/*.stl"))
 #: Place of the object's default prim: turned, moved, and scaled from decimetres to the centimetres of the stage.
@@ -34,7 +34,8 @@ def write_block(folder: Path, *, more: str = "") -> Path:
     )
     corners = ", ".join(map(str, mesh.faces.ravel()))
     (folder / "parts").mkdir(parents=True)
-    (folder / "parts" / "body.usda").write_text(f"""#usda 1.0
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.ImportFromString(f"""#usda 1.0
 (
  defaultPrim = "Body"
 )
@@ -43,16 +44,17 @@ def Mesh "Body" {{
  point3f[] points = [{points}]
  int[] faceVertexCounts = [{", ".join(["3"] * len(mesh.faces))}]
  int[] faceVertexIndices = [{corners}]
- uniform token subdivisionScheme = "none"
+ uniform token subdivisionScheme = "loop"
 }}
 """)
+    layer.Export(str(folder / "parts" / "body.usdc"))
     rows = ", ".join(f"({', '.join(map(str, row))})" for row in PLACE.T)
     (folder / "block.usda").write_text(f"""#usda 1.0
 def Xform "Block" {{
  matrix4d xformOp:transform = ( {rows} )
  uniform token[] xformOpOrder = ["xformOp:transform"]
  {more}
- def "body" (references = @./parts/body.usda@) {{}}
+ def "body" (references = @./parts/body.usdc@) {{}}
 }}
 """)
     return folder / "block.usda"
