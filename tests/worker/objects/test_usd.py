@@ -14,6 +14,7 @@ import pytest
 from graspd.service.model.errors import MeshError
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.formats import read_mesh
+from graspd.worker.objects.mesh_geometry import signed_volume
 from graspd.worker.objects.prepare import files_from_path, load_object
 
 pytest.importorskip("pxr", reason="needs the extra usd")
@@ -90,6 +91,8 @@ def Xform "Thing" {{
  }}
 }}"""
     obj = load_object({"a.usda": stage(more)}, name="a", digest="", face_error_m=0, options={"compound": True})
+    soup = read_mesh("a.usda", stage(more))
+    assert signed_volume(soup.vertices, soup.faces) == pytest.approx(obj.volume, rel=1e-5), "inside out"
     assert obj.volume == pytest.approx((2 + 3 * 8) / 6 * 1e-6, rel=1e-5)
     assert obj.vertices[:, 0].max() == pytest.approx(0.3)
 
