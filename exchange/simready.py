@@ -127,7 +127,7 @@ class _Asset:
         UsdUtils.ModifyAssetPaths(layer, lambda path: str(here / path) if path and (here / path).is_file() else path)
         self.layer, self.stage = layer, Usd.Stage.Open(layer)
         tops = [prim for prim in self.stage.GetPseudoRoot().GetChildren() if not prim.IsAbstract()]
-        self.root = self.stage.GetDefaultPrim() or (tops[0] if len(tops) == 1 else None)
+        self.root: Any = self.stage.GetDefaultPrim() or (tops[0] if len(tops) == 1 else None)
         if not self.root or self.root.GetChild("graspd"):
             raise InputError(f"{source} has no default prim, or grasps already; name one, or give the original file")
         self.stage.SetDefaultPrim(self.root)
@@ -219,7 +219,7 @@ class _Asset:
 
     def write(self, out: Path) -> None:
         # The stage would look for the layers at their new paths.
-        self.stage = self.root = self.scope = None
+        del self.stage, self.root, self.scope
         folder = out.resolve().parent
         folder.mkdir(parents=True, exist_ok=True)
         UsdUtils.ModifyAssetPaths(

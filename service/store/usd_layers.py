@@ -57,7 +57,7 @@ def open_layers(root: Path, main: str) -> dict[str, Any]:
 
 def _resolve(root: Path, layer: str, reference: str) -> str:
     name = posixpath.normpath(posixpath.join(posixpath.dirname(layer), reference.replace("\\", "/")))
-    if name.startswith(("/", "..")) or ":" in reference or not (root / name).resolve().is_relative_to(root.resolve()):
+    if ":" in reference or not (root / name).resolve().is_relative_to(root.resolve()):
         why = "outside its folder; give the folder that holds both as a ZIP"
     elif not name.lower().endswith(SUFFIXES[:3]):
         why = "which is no USD layer"

@@ -185,7 +185,7 @@ class _Reader:
     def _shape(self, shape: dict[str, Any], frame: Floats, approximation: str) -> Shape:
         """Return a shape in the body's frame, whose inverse pose is `frame` (7,)."""
         vertices, faces = self.stage.mesh(shape)
-        vertices, faces = quat_rotate(frame[3:], vertices) + frame[:3], faces.astype(np.int32)
+        vertices = quat_rotate(frame[3:], vertices) + frame[:3]
         colours = self.stage.colours(shape, len(faces))
         known = colours[~np.isnan(colours).any(axis=1)]
         r, g, b = map(float, known.mean(axis=0)) if len(known) else (0.0, 0.0, 0.0)
@@ -200,7 +200,7 @@ class _Reader:
             axes = quat_to_matrix(self._rigid(np.array(shape["matrix"]))[3:]).T @ quat_to_matrix(frame[3:]).T
             corners = np.array(np.meshgrid(*zip((used @ axes.T).min(axis=0), (used @ axes.T).max(axis=0), strict=True)))
             used = corners.reshape(3, -1).T @ axes
-        made = hull(used) if approximation in ("convexHull", "boundingCube") else (vertices, faces)
+        made = hull(used) if approximation in ("convexHull", "boundingCube") else (vertices, faces.astype(np.int32))
         return Shape("mesh", (1.0, 1.0, 1.0), IDENTITY_POSE, mesh=made, colour=colour)
 
     def _exact(self, shape: Mapping[str, Any], frame: Floats) -> Shape | None:
