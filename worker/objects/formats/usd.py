@@ -57,8 +57,6 @@ class Stage:
     def colours(self, shape: Mapping[str, Any], count: int) -> Floats:
         """Return sRGB colours (F, 3) of `count` triangles; nan if the file states none."""
         linear = self.arrays.get(f"colours{shape.get('mesh')}", np.full((count, 3), np.nan))
-        if shape["colour"] is not None:
-            linear = np.where(np.isnan(linear), shape["colour"], linear)
         return np.clip(from_linear(linear), 0, 1)
 
     def mass(self, bodies: Mapping[str, Any]) -> float:

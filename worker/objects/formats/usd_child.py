@@ -150,7 +150,7 @@ class _Reader:
 
     def _add_shape(self, prim: Any, matrix: np.ndarray, state: dict[str, Any]) -> None:
         kind = str(prim.GetTypeName())
-        shape = {"kind": kind, "path": str(prim.GetPath()), "matrix": matrix.tolist(), "colour": self._colour(prim)}
+        shape: dict[str, Any] = {"kind": kind, "path": str(prim.GetPath()), "matrix": matrix.tolist()}
         if kind == "Mesh":
             shape["mesh"] = self._mesh(prim)
         elif kind in _SIZES:
@@ -189,8 +189,6 @@ class _Reader:
             if subset.GetElementTypeAttr().Get() == "face" and ((chosen >= 0) & (chosen < len(label))).all():
                 label[chosen] = len(parts)
                 parts.append(subset.GetPrim().GetName())
-                if colour := self._colour(subset.GetPrim()):
-                    colours[chosen] = colour
         triangles = triangulate(np.array(points, float), counts, corners)
         owner = np.repeat(np.arange(len(counts)), np.maximum(counts - 2, 0))
         turned = triangles[:, ::-1] if self._value(prim, "orientation") == "leftHanded" else triangles
@@ -217,17 +215,6 @@ class _Reader:
             colours = (sums[ends] - sums[ends - counts]) / np.maximum(counts, 1)[:, None]
         fits = len(colours) in (1, len(counts))
         return np.broadcast_to(colours if fits else np.nan, (len(counts), 3)).copy()
-
-    def _colour(self, prim: Any) -> list[float] | None:
-        """Return the linear colour (3,) of the bound material, if a number states it."""
-        material = self.shade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
-        for context in ("", "mdl") if material else ():
-            shader = material.ComputeSurfaceSource(context)[0]
-            for name in ("diffuseColor", "diffuse_color_constant") if shader else ():
-                given = shader.GetInput(name)
-                if given and not given.HasConnectedSource() and (colour := given.Get(self.time)) is not None:
-                    return [float(part) for part in colour][:3]
-        return None
 
     def _joint(self, joint: Any) -> dict[str, Any]:
         prim = joint.GetPrim()
