@@ -38,6 +38,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("clouds", "graspd.commands.curate", "Use grasps", "Convert pictures to point clouds with grasps."),
     ("export", "graspd.commands.exchange", "Use grasps", "Export grasps and pictures to other formats."),
     ("import", "graspd.commands.exchange", "Use grasps", "Import grasps from other formats and validate them."),
+    ("simready", "graspd.commands.exchange", "Use grasps", "Add grasps to the USD file of their object (SimReady)."),
     ("up", "graspd.service.run.commands", "Service", "Run the whole service on this machine until Ctrl-C."),
     ("submit", "graspd.client.commands", "Service", "Submit a job: one hand on one object."),
     ("jobs", "graspd.client.commands", "Service", "List jobs, newest first."),

@@ -13,8 +13,9 @@ from graspd.service.cli import load_settings
 from graspd.service.model.errors import InputError, LimitError
 from graspd.service.model.names import shorten_name
 from graspd.service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
+from graspd.service.store.usd_layers import SUFFIXES as USD
 
-SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb")
+SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb", *USD)
 #: Stems of mesh files in order of preference, if an object has several meshes: closed and cleaned scans first.
 PREFERRED: Final = ("clean", "nontextured", "textured_simple", "textured", "collision", "visual", "raw")
 #: Names of inner folders that describe the processing of a mesh, not the object.
