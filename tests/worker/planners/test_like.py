@@ -88,11 +88,11 @@ def test_a_grasp_file_stands_for_a_row_by_default_the_first_valid_one(tmp_path: 
         (tmp_path / name).write_bytes(write_shard("base", columns | {"quality/valid": np.array(valid, np.uint8)}, said))
     some = f"{tmp_path}/some.h5"
     for text, x in ((some, 0.2), (f"{some}:0", 0.1), (f"{some}:2", 0.3)):
-        assert parse_pose(wrist_pose(text)) == (x, 0, 0, 1, 0, 0, 0)
+        assert parse_pose(wrist_pose(text, "allegro", "mug", {})) == (x, 0, 0, 1, 0, 0, 0)
     for text, words in ((f"{some}:3", "has 3 grasps"), (f"{tmp_path}/none.h5", "no valid grasp: choose a row")):
         with pytest.raises(InputError, match=words):
-            wrist_pose(text)
-    assert wrist_pose("") == "" and wrist_pose("0, 0, 0, 1, 0, 0, 0") == "0, 0, 0, 1, 0, 0, 0"
+            wrist_pose(text, "allegro", "mug", {})
+    assert wrist_pose("", "", "", {}) == "" and wrist_pose("0, 0, 0, 1, 0, 0, 0", "", "", {}) == "0, 0, 0, 1, 0, 0, 0"
 
 
 def test_free_grasps_are_near_the_pose_and_columns_exist_only_then(plain: SynthesisResult) -> None:
