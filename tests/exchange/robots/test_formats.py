@@ -87,10 +87,24 @@ def test_isaac_names_prims_that_the_usd_export_has(tmp_path: Path) -> None:
     usd = pytest.importorskip("pxr.Usd")
     isaac = yaml.safe_load(next(export_of("barrett", "isaac", tmp_path).glob("*.yaml")).read_text())
     export(tmp_path / "grasps.h5", "usd", tmp_path / "usd")
-    stage = usd.Stage.Open(str(next((tmp_path / "usd").glob("*.usd"))))
+    file = next((tmp_path / "usd").glob("*.usd"))
+    stage = usd.Stage.Open(str(file))
     assert isaac["object_frame_link"] == "/World/_003_mug_v2_final"
-    for name in ("object_frame_link", "gripper_frame_link"):
-        assert stage.GetPrimAtPath(isaac[name]).IsValid()
+    thing, hand = (stage.GetPrimAtPath(isaac[name]) for name in ("object_frame_link", "gripper_frame_link"))
+    cache = pytest.importorskip("pxr.UsdGeom").XformCache(usd.TimeCode.Default())
+    placed = [np.array(cache.GetLocalToWorldTransform(prim)).T for prim in (thing, hand)]
+    grasp = isaac["grasps"][file.stem]
+    pose = [*grasp["position"], grasp["orientation"]["w"], *grasp["orientation"]["xyz"]]
+    np.testing.assert_allclose(np.linalg.inv(placed[0]) @ placed[1], pose_to_matrix(np.array(pose)), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["3-finger hand", "手 爪", "", "mug (2).v1", "__", "ßÄ"])
+def test_every_name_becomes_a_legal_prim_of_its_own(name: str) -> None:
+    sdf = pytest.importorskip("pxr.Sdf")
+    names = prim_names(["scene", name, name])
+    assert len(set(names)) == 3
+    for one in names:
+        assert sdf.Path.IsValidIdentifier(one) and one.isascii()
 
 
 @pytest.mark.parametrize("which", ["free_shard", "table_shard", "pressing_shard", "clutter_shard"])
