@@ -16,10 +16,11 @@ from graspd.service.store.assets import UNPACK_FACTOR, ZipFiles, asset_json, che
 from graspd.service.store.descriptions import parse_json_object
 from graspd.service.store.hand_files import SUFFIXES, find_main_file, hand_name
 from graspd.service.store.network_file import NETWORK_FILE, check_size
+from graspd.service.store.usd_layers import SUFFIXES as USD
 
 MAIN_SUFFIXES: Final[dict[AssetKind, tuple[str, ...]]] = {
     AssetKind.HAND: SUFFIXES,
-    AssetKind.OBJECT: (".stl", ".obj", ".ply", ".glb", ".gltf", ".off"),
+    AssetKind.OBJECT: (".stl", ".obj", ".ply", ".glb", ".gltf", ".off", *USD),
     AssetKind.NETWORK: (".npz",),
 }
 _NAME: Final = re.compile(r"[^A-Za-z0-9._-]+")

@@ -109,6 +109,8 @@ def taxonomy(given: argparse.Namespace) -> Iterator[str]:
         *("number", "type", "objects that admit it", "share on these", "best object"),
     )
     for name, number in sorted(TAXONOMY.items(), key=lambda item: item[1]):
+        if name not in (given.types or TAXONOMY):
+            continue
         found = {obj: Cell(given, "shadow", obj, given.grasps // 2, type=name).good.mean() for obj in TAXONOMY_OBJECTS}
         admitted = [share for share in found.values() if share > 0]
         best = max(found, key=lambda obj: found[obj])
@@ -227,6 +229,7 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=list(PARTS))
     parser.add_argument("--objects", nargs="+")
+    parser.add_argument("--types", nargs="+", choices=list(TAXONOMY), help="types of part taxonomy; default: all")
     parser.add_argument("--grasps", type=int, default=16)
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--page", type=Path, help="file for the tables in Markdown")

@@ -1,10 +1,11 @@
 """Quality and speed of grasps on a GPU, compared with the CPU of the same machine; prints Markdown.
 
-usage: python -m benchmarks.on_gpu DATA_DIR [--device cuda:0] [--batches 32 256 1024] [--grasps 64]
+usage: python -m benchmarks.on_gpu DATA_DIR [--device cuda:0] [--batches 32 256 1024] [--grasps 64] [--chain 3072]
            [--json OUT] [--page OUT]
 
 DATA_DIR holds hands/ and objects/. For accuracy, both devices plan grasps from the same seeds; the CPU validates
-and measures them. Speed is the wall time of each stage of a launch, after an untimed one."""
+and measures them. Speed is the wall time of each stage of a launch, after an untimed one. The whole chain makes
+`--chain` valid grasps as a worker does, with all cores and its pool of processes, after an untimed first batch."""
 
 from __future__ import annotations
 
@@ -13,6 +14,8 @@ import json
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -23,17 +26,24 @@ import warp as wp
 
 from benchmarks.success import HANDS
 from graspd.service.model.cores import available_cores
+from graspd.service.model.domain import BATCH_SIZE, JobOptions
 from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.matter import MASS_KG
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.studies.bench import device_name, kernel_shares
+from graspd.worker.batched_generation import validated_batches
+from graspd.worker.engines.batch_sizes import batches_per_launch, pool_process_count
 from graspd.worker.engines.devices import Device
-from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.execution_context import ExecutionContext, PrefilterMode
+from graspd.worker.generation import ValidatedBatch
+from graspd.worker.grasps import join_grasp_sets
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.fast_graspd import planner
 from graspd.worker.planners.port import PlanRequest
+from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.quality.table import measure
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.validator import validate
@@ -48,6 +58,10 @@ VALIDATED: Final = 128
 #: Compared metrics (means over the grasps), with their digits in the report.
 COLUMNS: Final = {"epsilon": 3, "penetration_depth_mm": 2, "contact_area_cm2": 1}
 SHOWN: Final = {"gsr": 2, **COLUMNS}
+#: Pairs of the whole chain.
+CHAIN: Final = (("Allegro", "025_mug"), ("Barrett", "003_cracker_box"), ("Shadow", "006_mustard_bottle"))
+#: Engines of the verdicts: MuJoCo on the CPU alone, or after the prefilter on the GPU.
+ENGINES: Final[dict[str, PrefilterMode]] = {"MuJoCo": "off", "prefilter": "on"}
 
 
 def say(line: str) -> None:
@@ -103,6 +117,38 @@ def speed(hand: HandModel, obj: ObjectModel, device: str, batches: Sequence[int]
     return [{"batch": batch, **stages(hand, obj, device, batch)} for batch in batches]
 
 
+def chain(hand: HandModel, obj: ObjectModel, device: str, engine: str, count: int) -> dict[str, Any]:
+    """Return valid grasps per second of the whole chain, their share of candidates, and the share of valid grasps
+    that holds at half friction."""
+    request = JobOptions(grasps=count, seed=SEED, mass=MASS_KG, rechecks=0)
+    join, processes = batches_per_launch(device, None), pool_process_count(device, 0)
+    with Pool(processes, MODULES) if processes > 1 else nullcontext() as pool:
+        run = ExecutionContext(device, prefilter=ENGINES[engine], pool=pool)
+
+        def make(grasps: int, first: int) -> tuple[list[ValidatedBatch], float]:
+            sizes = [min(BATCH_SIZE, grasps - k) for k in range(0, grasps, BATCH_SIZE)]
+            return timed(
+                lambda: validated_batches(
+                    hand, obj, request, sizes=sizes, first=first, join=join, run=run, partial=True
+                )
+            )
+
+        make(2 * BATCH_SIZE, 1000)
+        made, seconds = make(count, 0)
+        valid, candidates = sum(len(one.grasps) for one in made), sum(one.candidates for one in made)
+        few = join_grasp_sets([one.grasps for one in made]).take(np.arange(min(valid, VALIDATED)))
+        hard = validate(hand, obj, few, hard=True, run=replace(run, prefilter="off")).success == 1
+    stages_s = {name: sum(one.seconds[name] for one in made) for name in made[0].seconds}
+    return {
+        "valid_per_s": valid / seconds,
+        "valid": valid,
+        "share": valid / candidates,
+        "hard": float(hard.mean()),
+        **{f"{name}_s": value for name, value in stages_s.items()},
+        "wall_s": seconds,
+    }
+
+
 def page(result: dict[str, Any]) -> str:
     lines = [
         "# A GPU against the CPU of the same machine",
@@ -146,6 +192,21 @@ def page(result: dict[str, Any]) -> str:
             for key, digits in SHOWN.items()
         )
         lines.append(f"| all | | {cells} |")
+    if result["chain"]:
+        lines += [
+            "",
+            f"Whole chain: {result['chain_grasps']} valid grasps (CPU: a quarter of them) at level standard and "
+            "0.1 kg, with metrics. *Valid*: share of the candidates that are valid; *hard*: share of valid grasps that "
+            "hold at half friction. On the CPU, rollouts select among a grasp's candidates.",
+            "",
+            "| hand | object | device | engine | valid/s | valid | hard |",
+            "| --- | --- | --- | --- | --: | --: | --: |",
+        ]
+        lines += [
+            f"| {row['hand']} | {row['object']} | {row['device']} | {row['engine']} | {row['valid_per_s']:.0f} | "
+            f"{row['share']:.2f} | {row['hard']:.2f} |"
+            for row in result["chain"]
+        ]
     return "\n".join(lines) + "\n"
 
 
@@ -155,13 +216,14 @@ def main() -> None:
     parser.add_argument("--device", default="auto")
     parser.add_argument("--batches", type=int, nargs="+", default=[32, 256, 1024])
     parser.add_argument("--grasps", type=int, default=64, help="grasps of each pair for the comparison of quality")
+    parser.add_argument("--chain", type=int, default=3072, help="valid grasps of the whole chain; 0: none")
     parser.add_argument("--json", type=Path, help="file for all figures, rewritten after each step")
     parser.add_argument("--page", type=Path, help="file for the report")
     wanted = parser.parse_args()
     device = Device(wanted.device).resolve()
     result: dict[str, Any] = {
         "command": f"python -m benchmarks.on_gpu DATA --batches {' '.join(map(str, wanted.batches))} "
-        f"--grasps {wanted.grasps}",
+        f"--grasps {wanted.grasps} --chain {wanted.chain}",
         "date": str(date.today()),
         "device": device_name(device),
         "cores": available_cores(),
@@ -171,6 +233,8 @@ def main() -> None:
         "grasps": wanted.grasps,
         "speed": {},
         "accuracy": {},
+        "chain": [],
+        "chain_grasps": wanted.chain,
     }
 
     def keep() -> None:
@@ -184,6 +248,16 @@ def main() -> None:
     for name, hand in hands.items():
         result["speed"][name] = speed(hand, meshes[OBJECTS[0]], device, wanted.batches)
         keep()
+    for at, engine in ((device, "MuJoCo"), ("cpu", "MuJoCo"), (device, "prefilter")) if wanted.chain else ():
+        for name, mesh in CHAIN:
+            if engine == "prefilter" and name == "Shadow":
+                continue  # the prefilter does not test hands with tendons
+            found = chain(hands[name], meshes[mesh], at, engine, wanted.chain // (4 if at == "cpu" else 1))
+            result["chain"].append(
+                {"hand": name, "object": mesh, "device": at.split(":")[0], "engine": engine, **found}
+            )
+            keep()
+            print(result["chain"][-1], file=sys.stderr, flush=True)  # noqa: T201
     pair = planner.pair_of(hands["Allegro"], meshes[OBJECTS[0]], FIDELITY, device)
     result["kernels"] = {str(n): kernel_shares(pair, FIDELITY, n) for n in wanted.batches}
     for name, hand in hands.items():

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from graspd.service.model.states import AssetKind
 from graspd.service.store.assets import builtin_files
@@ -70,6 +70,7 @@ def _meshes(folder: Path) -> None:
     shutil.copy(folder / "mug.stl", folder / "ycb" / "025_mug.stl")
     shutil.copy(folder / "bottle.stl", folder / "ycb" / "006_mustard_bottle.stl")
     (folder / "my-objects").symlink_to("ycb")
+    _write_usd(folder / "mug.usda", trimesh.load_mesh(folder / "mug.stl"))
     mesh.export(folder / "koala.obj")
     mesh.copy().apply_scale(1000).export(folder / "banana.stl")
     trimesh.creation.box((0.12, 0.07, 0.015)).export(folder / "scissors.stl")
@@ -78,6 +79,15 @@ def _meshes(folder: Path) -> None:
     trimesh.util.concatenate([box, box.copy().apply_translation((0.03, 0, 0))]).export(folder / "overlap.stl")
     box.update_faces(box.face_normals[:, 2] < 0.5)
     box.export(folder / "bowl.stl")
+
+
+def _write_usd(path: Path, mesh: Any) -> None:
+    points, corners = (", ".join(map(str, part)) for part in (map(tuple, mesh.vertices.tolist()), mesh.faces.ravel()))
+    counts = ", ".join(["3"] * len(mesh.faces))
+    path.write_text(
+        f'#usda 1.0\n(defaultPrim = "Mug"\nmetersPerUnit = 1\n)\ndef Mesh "Mug" {{\npoint3f[] points = [{points}]\n'
+        f"int[] faceVertexCounts = [{counts}]\nint[] faceVertexIndices = [{corners}]\n}}\n"
+    )
 
 
 def _hands(folder: Path) -> None:

@@ -5,7 +5,6 @@ prims and cameras. USD's conventions: matrices act on row vectors, cameras look 
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +15,7 @@ from graspd.exchange.plan import prim_name
 from graspd.service.model.transforms import Floats
 from graspd.service.store.shards import Shard
 from graspd.worker.rendering.annotate import BACKGROUND, OBJECT, TABLE
-from graspd.worker.rendering.export import export_images
+from graspd.worker.rendering.export import export_images, write_json
 
 _ID: Final = ("semanticId", "<u4")
 _OCCLUSION: Final = ("occlusionRatio", "<f4")
@@ -95,20 +94,15 @@ def _write_annotations(views: Shard, view: int, name: str, folder: Path) -> list
         np.asarray(views["box/bounding_box_3d"][view], float), np.asarray(views["camera/extrinsics"][view], float)
     )
     boxes["bounding_box_3d"] = np.array([(0, *low, *high, transform, hidden)], _BOX_3D)
-    written = [_write_json(folder / f"camera_params_{view:04}.json", camera_params(views, view))]
+    written = [write_json(folder / f"camera_params_{view:04}.json", camera_params(views, view))]
     for what, rows in boxes.items():
         np.save(folder / f"{what}_{view:04}.npy", rows)
         written.append(folder / f"{what}_{view:04}.npy")
-        written.append(_write_json(folder / f"{what}_labels_{view:04}.json", {"0": {"class": name}}))
+        written.append(write_json(folder / f"{what}_labels_{view:04}.json", {"0": {"class": name}}))
         written.append(
-            _write_json(folder / f"{what}_prim_paths_{view:04}.json", [f"/World/{prim_name(name)}"] * len(rows))
+            write_json(folder / f"{what}_prim_paths_{view:04}.json", [f"/World/{prim_name(name)}"] * len(rows))
         )
     labels = {BACKGROUND: "BACKGROUND", TABLE: "table", OBJECT: name}
     said = {str(label): {"class": word} for label, word in labels.items()}
-    written.append(_write_json(folder / f"semantic_segmentation_labels_{view:04}.json", said))
+    written.append(write_json(folder / f"semantic_segmentation_labels_{view:04}.json", said))
     return written
-
-
-def _write_json(path: Path, value: Any) -> Path:
-    path.write_text(json.dumps(value) + "\n")
-    return path

@@ -19,6 +19,7 @@ import warp as wp
 from graspd.service.model.cores import available_cores
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.version import PACKAGE_VERSION
+from graspd.studies.figures import markdown_table, new_figure, plain_axes
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -217,18 +218,21 @@ def clock_of(device: str) -> Callable[[], float]:
 
 def results_table(result: dict[str, Any]) -> str:
     """Return the result of `bench` in Markdown."""
+    rows = [
+        [
+            *(r["fidelity"], _batch_text(r), r["processes"], f"{r['coarse_points']}, {r['hand_points']}", r["faces"]),
+            *(r["iterations"], f"{r['ms_per_iteration']:.2f}", f"{r['grasps_per_second']:.1f}"),
+            *(f"{100 * r['spread']:.0f} %", f"{r['peak_memory_mb']:.0f}"),
+        ]
+        for r in result["runs"]
+    ]
     lines = [
         f"{result['hand']} on {result['object']}, {result['device']}, graspd {result['versions']['graspd']}, "
         f"Warp {result['versions']['warp']}",
         "",
-        "| fidelity | batch | threads | hand points | faces | its | ms/it | grasps/s | spread | peak MB |",
-        "| --- | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
-    ]
-    lines += [
-        f"| {r['fidelity']} | {_batch_text(r)} | {r['processes']} | {r['coarse_points']}, {r['hand_points']} "
-        f"| {r['faces']} | {r['iterations']} | {r['ms_per_iteration']:.2f} | {r['grasps_per_second']:.1f} "
-        f"| {100 * r['spread']:.0f} % | {r['peak_memory_mb']:.0f} |"
-        for r in result["runs"]
+        markdown_table(
+            "fidelity | batch | threads | hand points | faces | its | ms/it | grasps/s | spread | peak MB", rows
+        ),
     ]
     for name, phase in result["kernels"].items():
         shares = ", ".join(f"{kernel} {100 * share:.0f} %" for kernel, share in phase["share"].items() if share >= 0.01)
@@ -256,9 +260,7 @@ def write(result: dict[str, Any], folder: Path) -> None:
 
 
 def _plot(result: dict[str, Any], path: Path) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    figure = new_figure(7, 4.2)
     axes = figure.add_subplot()
     for key in dict.fromkeys((r["fidelity"], r["processes"]) for r in result["runs"]):
         runs = sorted((r for r in result["runs"] if (r["fidelity"], r["processes"]) == key), key=lambda r: r["grasps"])
@@ -269,7 +271,6 @@ def _plot(result: dict[str, Any], path: Path) -> None:
     axes.set_xticks(batches, [str(batch) for batch in batches], minor=False)
     axes.set(xlabel="grasps per call", ylabel="grasps per second", ylim=(0, None))
     axes.set_title(f"{result['hand']} on {result['object']}, {result['device']}", loc="left", fontsize=11)
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
+    plain_axes(axes)
     axes.legend(frameon=False, fontsize=8)
     figure.savefig(path, dpi=150)

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, Final, Literal, cast
+from typing import Any, Final, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspd.exchange.inputs import Case
-from graspd.service.model.errors import InputError, MeshError
+from graspd.service.model.errors import InputError, MeshError, choices_text
 from graspd.service.model.metrics import perturbed_parameter_name
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet
@@ -55,7 +55,7 @@ def evaluate(
     case: Case,
     *,
     protocol: Protocol = "dexgraspbench",
-    level: Level | LiftLevel = "standard",
+    level: str = "",
     hard: bool = False,
     friction: float | None = None,
     models: int = 0,
@@ -66,7 +66,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """Return a row of numbers; undefined ones are None, such as gsr of an object too thin to validate.
 
-    Level dexgraspbench uses the mass and friction of its protocol, other levels those of the object.
+    An empty level means standard, for protocol lift level lift. Level dexgraspbench uses the mass and friction of its
+    protocol, other levels those of the object.
 
     - gsr: share that holds; osr: 1 if any holds; sgs: held grasps per second of planning and validation;
       sgs_without_validation: per second of planning alone; verdicts: see `_verdict_rows`
@@ -77,7 +78,8 @@ def evaluate(
     - protocol lift: clear_share, without collision in approach, closing and lift
     - with another model of the hand, `validation_hand`: `ForeignVerdicts.facts`, held_foreign and reason_foreign
 
-    Raises InputError: protocol lift on grasps of a free object, or dexgraspbench with an unknown level."""
+    Raises InputError: protocol lift on grasps of a free object, or a level that the protocol lacks."""
+    level = checked_level(protocol, level)
     if protocol == "lift" and case.placed is None:
         raise InputError(f"{case.name} has free grasps, but a lift test needs a scene: graspd synth --scene")
     case = case.centred
@@ -105,7 +107,7 @@ def evaluate(
             for one, held, reason in zip(row["verdicts"], both.foreign.success, both.foreign.reasons, strict=True):
                 one |= {"held_foreign": bool(held), "reason_foreign": reason}
     elif protocol == "lift" and case.placed is not None:
-        common |= {"placed": case.placed, "level": "dexgraspbench" if level == "dexgraspbench" else "lift"}
+        common |= {"placed": case.placed, "level": level}
         grasps, clear = with_trajectories(case, case.placed)
         lifts = validate_lifts(case.hand, case.obj, grasps, **common)
         row |= _lift_rates(lifts, clear)
@@ -113,6 +115,18 @@ def evaluate(
             row |= _model_results(case, grasps, row, models, tell, held=lifts.success, **common)
     sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, run=run)
     return row | pieces.facts | _medians(case, table, sd)
+
+
+def checked_level(protocol: str, level: str) -> str:
+    """Return the level, or the default of the protocol if `level` is empty.
+    Raises InputError: the protocol or the level is unknown."""
+    if protocol not in get_args(Protocol):
+        raise InputError(f"unknown protocol {protocol!r}; choose {choices_text(protocol, get_args(Protocol))}")
+    levels = get_args(LiftLevel if protocol == "lift" else Level)
+    level = level or ("lift" if protocol == "lift" else "standard")
+    if level not in levels:
+        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {choices_text(level, levels)}")
+    return level
 
 
 def _model_results(

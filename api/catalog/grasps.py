@@ -26,7 +26,7 @@ from graspd.service.model.metrics import (
 from graspd.service.model.records import MOST_TAGGED, Grasp
 from graspd.service.model.scene_spec import scene_supports
 from graspd.service.pipeline.backends import Services
-from graspd.service.readers.trajectories import scene_spec_of, slider_positions, trajectory_of
+from graspd.service.readers.trajectories import planned_scene_of, slider_positions, trajectory_of
 from graspd.service.store.columns import LIFT_OUTCOMES, PUSH_OUTCOMES
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import Shard, read_shard
@@ -209,8 +209,7 @@ def _read_waypoints(file: Shard, row: int) -> list[models.Waypoint]:
 
 def _read_scene(file: Shard, row: int) -> models.GraspScene | None:
     """Return the scene of a grasp; None if it was planned around a free object."""
-    spec = scene_spec_of(file)
-    if spec is None or spec.kind == "free" or "grasp/scene_index" not in file.arrays:
+    if (spec := planned_scene_of(file)) is None:
         return None
     number = int(file["grasp/scene_index"][row])
     tried = int(file[_LIFT][row]) if _LIFT in file.arrays else 0

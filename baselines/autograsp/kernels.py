@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from graspd.worker.simulation.kernels.kinematics import Hands
 from graspd.worker.simulation.kernels.pieces import (
     BodyPoints,
     Pieces,
@@ -30,50 +31,39 @@ class Closing:
 
 @wp.kernel
 def points_to_object(
-    # Model:
     surface_in: Surface,
     reach_in: wp.float32,
     exact_in: wp.float32,
     body_in: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3),
-    # Data in:
-    active_in: wp.array(dtype=wp.int32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
-    # Data out:
+    hands_in: Hands,
     near_inout: wp.array2d(dtype=wp.float32),
 ):
     """Compute the least distance of each body's points from the object. Launch over (B, N)."""
     b, i = wp.tid()
-    if active_in[b] == 0:
+    if hands_in.active[b] == 0:
         return
     body = body_in[i]
-    point = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], position_in[i])
+    point = hands_in.body_p[b, body] + wp.quat_rotate(hands_in.body_q[b, body], position_in[i])
     wp.atomic_min(near_inout, b, body, distance(surface_in, point, reach_in, exact_in, reach_in).distance)
 
 
 @wp.kernel
 def object_to_pieces(
-    # Model:
     pieces_in: Pieces,
     bvh_in: wp.uint64,
     sample_in: wp.array(dtype=wp.vec3),
-    # Data in:
-    active_in: wp.array(dtype=wp.int32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
-    # In:
+    hands_in: Hands,
     margin_in: wp.float32,
-    # Data out:
     near_inout: wp.array2d(dtype=wp.float32),
 ):
     """Include the object's samples within `margin` in the least distances. Launch over (B, P).
     The samples include the object's edges."""
     b, piece = wp.tid()
-    if active_in[b] == 0:
+    if hands_in.active[b] == 0:
         return
-    q = piece_rotation(pieces_in, piece, b, body_q_in)
-    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
+    q = piece_rotation(pieces_in, piece, b, hands_in.body_q)
+    p = piece_centre(pieces_in, piece, b, hands_in.body_p, hands_in.body_q)
     extent = world_extent(wp.quat_to_matrix(q), pieces_in.half[piece]) + wp.vec3(margin_in, margin_in, margin_in)
     least = float(1.0e3)
     query = wp.bvh_query_aabb(bvh_in, p - extent, p + extent)
@@ -87,32 +77,26 @@ def object_to_pieces(
 
 @wp.kernel
 def bodies_to_pieces(
-    # Model:
     pieces_in: Pieces,
     points_in: BodyPoints,
-    # Data in:
-    active_in: wp.array(dtype=wp.int32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
-    # In:
+    hands_in: Hands,
     margin_in: wp.float32,
-    # Data out:
     pair_inout: wp.array3d(dtype=wp.float32),
 ):
     """Compute the least distance between bodies that must not touch. Launch over (B, P).
     The distance is that of one body's points from the other's pieces."""
     b, piece = wp.tid()
-    if active_in[b] == 0:
+    if hands_in.active[b] == 0:
         return
     other = pieces_in.body[piece]
-    q = piece_rotation(pieces_in, piece, b, body_q_in)
-    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
+    q = piece_rotation(pieces_in, piece, b, hands_in.body_q)
+    p = piece_centre(pieces_in, piece, b, hands_in.body_p, hands_in.body_q)
     reach = wp.length(pieces_in.half[piece]) + margin_in
-    for own in range(body_p_in.shape[1]):
-        if may_touch(pieces_in, points_in, other, p, reach, own, b, body_p_in, body_q_in):
+    for own in range(hands_in.body_p.shape[1]):
+        if may_touch(pieces_in, points_in, other, p, reach, own, b, hands_in.body_p, hands_in.body_q):
             least = float(margin_in)
             for i in range(points_in.first[own], points_in.first[own + 1]):
-                x = body_p_in[b, own] + wp.quat_rotate(body_q_in[b, own], points_in.position[i])
+                x = hands_in.body_p[b, own] + wp.quat_rotate(hands_in.body_q[b, own], points_in.position[i])
                 nd = piece_distance(pieces_in, piece, wp.quat_rotate_inv(q, x - p))
                 least = wp.min(least, nd[3])
             wp.atomic_min(pair_inout, b, own, other, least)
@@ -138,27 +122,22 @@ def least_gap(
 
 @wp.kernel
 def close(
-    # Model:
     closing_in: Closing,
-    # Data in:
     near_in: wp.array2d(dtype=wp.float32),
     pair_in: wp.array3d(dtype=wp.float32),
-    # In:
     touch_in: wp.float32,
     share_in: wp.float32,
     largest_in: wp.float32,
-    # Data out:
-    active_inout: wp.array(dtype=wp.int32),
+    hands_inout: Hands,
     stopped_inout: wp.array2d(dtype=wp.int32),
-    q_inout: wp.array2d(dtype=wp.float32),
 ):
     """Stop dofs that move a touching body; close the others by one step. Launch over B.
     The step skips no contact. A point of body a moves by at most the sum of lever[d, a] |dq_d| over the closing dofs d.
     All dofs of a finger have the same step, share * gap / sum lever (conservative advancement)."""
     b = wp.tid()
-    if active_inout[b] == 0:
+    if hands_inout.active[b] == 0:
         return
-    dofs = q_inout.shape[1]
+    dofs = hands_inout.q.shape[1]
     for d in range(dofs):
         if stopped_inout[b, d] == 0:
             for body in range(near_in.shape[1]):
@@ -181,35 +160,31 @@ def close(
                                     travel += closing_in.lever[k, body]
                             gap = least_gap(closing_in, b, e, body, near_in, pair_in)
                             step = wp.min(step, share_in * gap / wp.max(travel, 1.0e-6))
-            value = q_inout[b, d] + closing_in.direction[d] * step
+            value = hands_inout.q[b, d] + closing_in.direction[d] * step
             if value <= closing_in.lower[d] or value >= closing_in.upper[d]:
                 value = wp.clamp(value, closing_in.lower[d], closing_in.upper[d])
                 stopped_inout[b, d] = 2
-            q_inout[b, d] = value
+            hands_inout.q[b, d] = value
     if open_dofs == 0:
-        active_inout[b] = 0
+        hands_inout.active[b] = 0
 
 
 @wp.kernel
 def advance(
-    # Data in:
     near_in: wp.array2d(dtype=wp.float32),
-    # In:
     direction_in: wp.array(dtype=wp.vec3),
     standoff_in: wp.float32,
     share_in: wp.float32,
-    # Data out:
-    active_inout: wp.array(dtype=wp.int32),
-    pivot_inout: wp.array(dtype=wp.vec3),
+    hands_inout: Hands,
 ):
     """Move the hand along its approach until a body is `standoff` from the object. Launch over B."""
     b = wp.tid()
-    if active_inout[b] == 0:
+    if hands_inout.active[b] == 0:
         return
     gap = near_in[b, 0]
     for body in range(1, near_in.shape[1]):
         gap = wp.min(gap, near_in[b, body])
     if gap - standoff_in < 1.0e-4:
-        active_inout[b] = 0
+        hands_inout.active[b] = 0
         return
-    pivot_inout[b] = pivot_inout[b] + (share_in * (gap - standoff_in)) * direction_in[b]
+    hands_inout.pivot[b] = hands_inout.pivot[b] + (share_in * (gap - standoff_in)) * direction_in[b]

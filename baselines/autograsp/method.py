@@ -143,13 +143,12 @@ class HandCloser:
         direction = np.zeros((self.capacity, 3))
         direction[:n] = quat_rotate(state.rotation, self.hand.palm.approach)
         self.data.set_state(state)
-        active, near = self.data.active, self.near
         with wp.ScopedDevice(self.model.device):
             along = wp.array(direction, dtype=wp.vec3)
         for _ in range(ADVANCES):
             self._measure()
-            self._launch(kernels.advance, (), [near, along, standoff, SHARE], [active, self.data.pivot])
-            if not active.numpy().any():
+            self._launch(kernels.advance, (), [self.near, along, standoff, SHARE], [self.data.hands])
+            if not self.data.active.numpy().any():
                 break
         return self.data.state(n)
 
@@ -162,7 +161,7 @@ class HandCloser:
         for _ in range(STEPS):
             self._measure(fingers=True)
             given = [self.closing, self.near, self.pairs, TOUCH_M, SHARE, LARGEST]
-            self._launch(kernels.close, (), given, [data.active, self.stopped, data.q])
+            self._launch(kernels.close, (), given, [data.hands, self.stopped])
             if not data.active.numpy().any():
                 break
         return data.state(n)
@@ -172,16 +171,15 @@ class HandCloser:
         Distances from the object are computed up to `REACH_M`, those from each other up to `MARGIN_M`."""
         m, d = self.model, self.data
         self._poses.run()
-        posed = [d.active, d.body_p, d.body_q]
         self.near.fill_(REACH_M)
         self.pairs.fill_(REACH_M)
         surface = [m.obj.surface, REACH_M, m.options.exact_below]
-        points = [*surface, m.point_body, m.point_position, *posed]
+        points = [*surface, m.point_body, m.point_position, d.hands]
         self._launch(kernels.points_to_object, (m.count,), points, [self.near])
-        samples = [m.hand.pieces, m.obj.bvh.id, m.obj.samples, *posed, MARGIN_M]
+        samples = [m.hand.pieces, m.obj.bvh.id, m.obj.samples, d.hands, MARGIN_M]
         self._launch(kernels.object_to_pieces, (m.pieces,), samples, [self.near])
         if fingers:
-            bodies = [m.hand.pieces, m.body_points, *posed, MARGIN_M]
+            bodies = [m.hand.pieces, m.body_points, d.hands, MARGIN_M]
             self._launch(kernels.bodies_to_pieces, (m.pieces,), bodies, [self.pairs])
 
     def _launch(self, kernel: Any, dims: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:

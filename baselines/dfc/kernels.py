@@ -6,6 +6,7 @@ temperature 18 * 0.95^floor(t / 30): a proposal is accepted with probability min
 
 import warp as wp
 
+from graspd.worker.simulation.kernels.kinematics import Hands
 from graspd.worker.simulation.kernels.optimizers import turn
 from graspd.worker.simulation.kernels.pieces import (
     Pieces,
@@ -16,7 +17,7 @@ from graspd.worker.simulation.kernels.pieces import (
     world_extent,
 )
 from graspd.worker.simulation.kernels.surface import Surface, mesh_distance
-from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
+from graspd.worker.simulation.kernels.wrenches import add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,6 +38,16 @@ SWAP = wp.constant(0.5)  # probability that a proposal replaces a contact
 FAR = wp.constant(1.0)  # largest distance that is computed [m]
 
 
+@wp.struct
+class Chains:
+    """Hands of B chains, and their contacts."""
+
+    pivot: wp.array(dtype=wp.vec3)
+    rotation: wp.array(dtype=wp.quat)
+    q: wp.array2d(dtype=wp.float32)
+    contact: wp.array2d(dtype=wp.int32)
+
+
 @wp.func
 def step_size(iteration: wp.int32):
     return STEP0 * wp.pow(COOL, wp.floor(float(iteration) / STEP_EVERY))
@@ -49,22 +60,13 @@ def temperature(iteration: wp.int32):
 
 @wp.kernel
 def propose(
-    # Model:
     candidates_in: wp.int32,
-    # Data in:
     iteration_in: wp.array(dtype=wp.int32),
     gradient_in: wp.array2d(dtype=wp.float32),
-    pivot_in: wp.array(dtype=wp.vec3),
-    rotation_in: wp.array(dtype=wp.quat),
-    q_in: wp.array2d(dtype=wp.float32),
-    contact_in: wp.array2d(dtype=wp.int32),
-    # Data out:
+    present_in: Chains,
     rng_inout: wp.array(dtype=wp.uint32),
     moment_inout: wp.array2d(dtype=wp.float32),
-    pivot_out: wp.array(dtype=wp.vec3),
-    rotation_out: wp.array(dtype=wp.quat),
-    q_out: wp.array2d(dtype=wp.float32),
-    contact_out: wp.array2d(dtype=wp.int32),
+    proposed_out: Chains,
     energy_out: wp.array2d(dtype=wp.float32),
 ):
     """Step down the gradient, redraw each contact with probability 1/2, reset energies. Launch over B.
@@ -73,7 +75,7 @@ def propose(
     b = wp.tid()
     it = iteration_in[0]
     size = step_size(it)
-    dofs = q_in.shape[1]
+    dofs = present_in.q.shape[1]
     scale = wp.vec3(0.0)
     for group in range(3):
         first = 3 * group
@@ -88,16 +90,16 @@ def propose(
         scale[group] = size / (wp.sqrt(v) + 1.0e-6)
     g = wp.vec3(gradient_in[b, 0], gradient_in[b, 1], gradient_in[b, 2])
     w = wp.vec3(gradient_in[b, 3], gradient_in[b, 4], gradient_in[b, 5])
-    pivot_out[b] = pivot_in[b] - scale[0] * g
-    rotation_out[b] = turn(rotation_in[b], -scale[1] * w)
+    proposed_out.pivot[b] = present_in.pivot[b] - scale[0] * g
+    proposed_out.rotation[b] = turn(present_in.rotation[b], -scale[1] * w)
     for d in range(dofs):
-        q_out[b, d] = q_in[b, d] - scale[2] * gradient_in[b, 6 + d]
+        proposed_out.q[b, d] = present_in.q[b, d] - scale[2] * gradient_in[b, 6 + d]
     rng = rng_inout[b]
     for k in range(N_CONTACTS):
-        index = contact_in[b, k]
+        index = present_in.contact[b, k]
         if wp.randf(rng) < SWAP:
             index = wp.min(int(wp.randf(rng) * float(candidates_in)), candidates_in - 1)
-        contact_out[b, k] = index
+        proposed_out.contact[b, k] = index
     rng_inout[b] = rng
     for term in range(energy_out.shape[1]):
         energy_out[b, term] = float(0.0)
@@ -105,17 +107,12 @@ def propose(
 
 @wp.kernel
 def force_closure(
-    # Model:
     surface_in: Surface,
     body_in: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3),
-    # Data in:
     contact_in: wp.array2d(dtype=wp.int32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
-    # Data out:
     energy_out: wp.array2d(dtype=wp.float32),
-    wrench_inout: Wrenches,
+    hands_inout: Hands,
 ):
     """Compute E_fc = |sum (n, x cross n)|^2 and E_dis = sum |d| (columns 0 and 1). Launch over B.
     Gradients treat normals as constant."""
@@ -124,7 +121,7 @@ def force_closure(
     t = wp.vec3(0.0)
     for k in range(N_CONTACTS):
         i = contact_in[b, k]
-        x = body_p_in[b, body_in[i]] + wp.quat_rotate(body_q_in[b, body_in[i]], position_in[i])
+        x = hands_inout.body_p[b, body_in[i]] + wp.quat_rotate(hands_inout.body_q[b, body_in[i]], position_in[i])
         sample = mesh_distance(surface_in, x, FAR)
         f += sample.normal
         t += wp.cross(x, sample.normal)
@@ -132,33 +129,28 @@ def force_closure(
     for k in range(N_CONTACTS):
         i = contact_in[b, k]
         body = body_in[i]
-        x = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], position_in[i])
+        x = hands_inout.body_p[b, body] + wp.quat_rotate(hands_inout.body_q[b, body], position_in[i])
         sample = mesh_distance(surface_in, x, FAR)
         distance_sum += wp.abs(sample.distance)
         gradient = 2.0 * wp.cross(sample.normal, t) + (W_DISTANCE * wp.sign(sample.distance)) * sample.normal
-        add_wrench(wrench_inout, b, body, gradient, wp.cross(x, gradient))
+        add_wrench(hands_inout.wrench, b, body, gradient, wp.cross(x, gradient))
     energy_out[b, 0] = wp.dot(f, f) + wp.dot(t, t)
     energy_out[b, 1] = distance_sum
 
 
 @wp.kernel
 def penetration(
-    # Model:
     pieces_in: Pieces,
     bvh_in: wp.uint64,
     sample_in: wp.array(dtype=wp.vec3),
-    # Data in:
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
-    # Data out:
     energy_inout: wp.array2d(dtype=wp.float32),
-    wrench_inout: Wrenches,
+    hands_inout: Hands,
 ):
     """Compute E_pen (column 2), the sum of depths of object samples in hand pieces. Launch over (B, P)."""
     b, piece = wp.tid()
     body = pieces_in.body[piece]
-    q = piece_rotation(pieces_in, piece, b, body_q_in)
-    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
+    q = piece_rotation(pieces_in, piece, b, hands_inout.body_q)
+    p = piece_centre(pieces_in, piece, b, hands_inout.body_p, hands_inout.body_q)
     half = pieces_in.half[piece]
     extent = world_extent(wp.quat_to_matrix(q), half)
     force = wp.vec3(0.0)
@@ -179,45 +171,37 @@ def penetration(
                 torque += wp.cross(x, f)
     if total > 0.0:
         wp.atomic_add(energy_inout, b, 2, total)
-        add_wrench(wrench_inout, b, body, force, torque)
+        add_wrench(hands_inout.wrench, b, body, force, torque)
 
 
 @wp.kernel
 def self_penetration(
-    # Model:
     first_in: wp.array(dtype=wp.int32),
     second_in: wp.array(dtype=wp.int32),
     body_in: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3),
-    # Data in:
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
-    # Data out:
     energy_inout: wp.array2d(dtype=wp.float32),
-    wrench_inout: Wrenches,
+    hands_inout: Hands,
 ):
     """Compute E_spen (column 3), the sum of max(0, gap - distance) over pairs. Launch over (B, pairs)."""
     b, pair = wp.tid()
     i = first_in[pair]
     j = second_in[pair]
-    x = body_p_in[b, body_in[i]] + wp.quat_rotate(body_q_in[b, body_in[i]], position_in[i])
-    y = body_p_in[b, body_in[j]] + wp.quat_rotate(body_q_in[b, body_in[j]], position_in[j])
+    x = hands_inout.body_p[b, body_in[i]] + wp.quat_rotate(hands_inout.body_q[b, body_in[i]], position_in[i])
+    y = hands_inout.body_p[b, body_in[j]] + wp.quat_rotate(hands_inout.body_q[b, body_in[j]], position_in[j])
     apart = wp.length(x - y)
     if apart < GAP and apart > 1.0e-9:
         wp.atomic_add(energy_inout, b, 3, GAP - apart)
         f = (-W_SELF / apart) * (x - y)
-        add_wrench(wrench_inout, b, body_in[i], f, wp.cross(x, f))
-        add_wrench(wrench_inout, b, body_in[j], -f, -wp.cross(y, f))
+        add_wrench(hands_inout.wrench, b, body_in[i], f, wp.cross(x, f))
+        add_wrench(hands_inout.wrench, b, body_in[j], -f, -wp.cross(y, f))
 
 
 @wp.kernel
 def limit_violation(
-    # Model:
     lower_in: wp.array(dtype=wp.float32),
     upper_in: wp.array(dtype=wp.float32),
-    # Data in:
     q_in: wp.array2d(dtype=wp.float32),
-    # Data out:
     energy_out: wp.array2d(dtype=wp.float32),
     gradient_inout: wp.array2d(dtype=wp.float32),
 ):
@@ -257,22 +241,14 @@ def is_accepted(rise: wp.float32, t: wp.float32, uniform: wp.float32):
 
 @wp.kernel
 def accept(
-    # Data in:
     iteration_in: wp.array(dtype=wp.int32),
     new_terms_in: wp.array2d(dtype=wp.float32),
     new_gradient_in: wp.array2d(dtype=wp.float32),
-    new_pivot_in: wp.array(dtype=wp.vec3),
-    new_rotation_in: wp.array(dtype=wp.quat),
-    new_q_in: wp.array2d(dtype=wp.float32),
-    new_contact_in: wp.array2d(dtype=wp.int32),
-    # Data out:
+    proposed_in: Chains,
     rng_inout: wp.array(dtype=wp.uint32),
     terms_inout: wp.array2d(dtype=wp.float32),
     gradient_inout: wp.array2d(dtype=wp.float32),
-    pivot_inout: wp.array(dtype=wp.vec3),
-    rotation_inout: wp.array(dtype=wp.quat),
-    q_inout: wp.array2d(dtype=wp.float32),
-    contact_inout: wp.array2d(dtype=wp.int32),
+    present_inout: Chains,
     taken_inout: wp.array(dtype=wp.int32),
 ):
     """Accept or reject the proposals. Launch over B.
@@ -285,12 +261,12 @@ def accept(
     if is_accepted(rise, temperature(iteration_in[0]), uniform) == 0:
         return
     taken_inout[b] = taken_inout[b] + 1
-    pivot_inout[b] = new_pivot_in[b]
-    rotation_inout[b] = new_rotation_in[b]
-    for d in range(q_inout.shape[1]):
-        q_inout[b, d] = new_q_in[b, d]
+    present_inout.pivot[b] = proposed_in.pivot[b]
+    present_inout.rotation[b] = proposed_in.rotation[b]
+    for d in range(present_inout.q.shape[1]):
+        present_inout.q[b, d] = proposed_in.q[b, d]
     for k in range(N_CONTACTS):
-        contact_inout[b, k] = new_contact_in[b, k]
+        present_inout.contact[b, k] = proposed_in.contact[b, k]
     for column in range(gradient_inout.shape[1]):
         gradient_inout[b, column] = new_gradient_in[b, column]
     for term in range(terms_inout.shape[1]):

@@ -148,14 +148,17 @@ class Descent:
             self.rng = wp.array(random, dtype=wp.uint32)
             self._allocate(contacts)
         self.proposal.set_state(starts)
-        for mine, other in zip(self.state, self._proposal_arrays(), strict=True):
-            wp.copy(mine, other)
+        self._copy_hands(self.proposed, self.present)
         self.launches = self._record()
 
     def _allocate(self, contacts: Ints) -> None:
         n, dofs = self.n, self.pair.hand.model.dofs
-        self.state = [wp.zeros(n, dtype=wp.vec3), wp.zeros(n, dtype=wp.quat), wp.zeros((n, dofs), dtype=wp.float32)]
-        self.contact, self.new_contact = (wp.array(contacts, dtype=wp.int32) for _ in range(2))
+        self.present, self.proposed = kernels.Chains(), kernels.Chains()
+        self.present.pivot, self.present.rotation = wp.zeros(n, dtype=wp.vec3), wp.zeros(n, dtype=wp.quat)
+        self.present.q = wp.zeros((n, dofs), dtype=wp.float32)
+        for name in ("pivot", "rotation", "q"):
+            setattr(self.proposed, name, getattr(self.proposal, name))
+        self.present.contact, self.proposed.contact = (wp.array(contacts, dtype=wp.int32) for _ in range(2))
         self.terms = wp.full((n, TERMS), INFINITE, dtype=wp.float32)
         self.new_terms = wp.zeros((n, TERMS), dtype=wp.float32)
         self.gradient = wp.zeros((n, 6 + dofs), dtype=wp.float32)
@@ -167,29 +170,29 @@ class Descent:
         self.pairs = len(first)
         self.keys = [wp.array(v, dtype=wp.int32) for v in (first, second, body)] + [wp.array(place, dtype=wp.vec3)]
 
-    def _proposal_arrays(self) -> list[Any]:
-        return [self.proposal.pivot, self.proposal.rotation, self.proposal.q]
+    @staticmethod
+    def _copy_hands(source: Any, target: Any) -> None:
+        for name in ("pivot", "rotation", "q"):
+            wp.copy(getattr(target, name), getattr(source, name))
 
     def _record(self) -> Launches:
         s, m, n, out = self.proposal, self.model, self.n, Launches(self.device)
-        pose, own = [s.body_p, s.body_q], [self.new_terms, s.wrench]
-        present = [*self.state, self.contact]
-        proposed = [*self._proposal_arrays(), self.new_contact]
-        given = [len(self.candidates), s.iteration, self.gradient, *present]
-        out.add(kernels.propose, n, inputs=given, outputs=[self.rng, self.moment, *proposed, self.new_terms])
+        own = [self.new_terms, s.hands]
+        given = [len(self.candidates), s.iteration, self.gradient, self.present]
+        out.add(kernels.propose, n, inputs=given, outputs=[self.rng, self.moment, self.proposed, self.new_terms])
         add_poses(out, m, s)
-        contacts = [self.candidate_body, self.candidate_position, self.new_contact]
-        out.add(kernels.force_closure, n, inputs=[self.obj.surface, *contacts, *pose], outputs=own)
+        contacts = [self.candidate_body, self.candidate_position, self.proposed.contact]
+        out.add(kernels.force_closure, n, inputs=[self.obj.surface, *contacts], outputs=own)
         samples = [m.hand.pieces, self.obj.bvh.id, self.obj.samples]
-        out.add(kernels.penetration, (n, m.pieces), inputs=[*samples, *pose], outputs=own)
+        out.add(kernels.penetration, (n, m.pieces), inputs=samples, outputs=own)
         if self.pairs:
-            out.add(kernels.self_penetration, (n, self.pairs), inputs=[*self.keys, *pose], outputs=own)
+            out.add(kernels.self_penetration, (n, self.pairs), inputs=self.keys, outputs=own)
         add_root_gradient(out, m, s)
         out.add(
             kernels.limit_violation, n, inputs=[m.hand.lower, m.hand.upper, s.q], outputs=[self.new_terms, s.gradient]
         )
-        kept = [self.rng, self.terms, self.gradient, *present, self.taken]
-        out.add(kernels.accept, n, inputs=[s.iteration, self.new_terms, s.gradient, *proposed], outputs=kept)
+        kept = [self.rng, self.terms, self.gradient, self.present, self.taken]
+        out.add(kernels.accept, n, inputs=[s.iteration, self.new_terms, s.gradient, self.proposed], outputs=kept)
         out.add(optimizers.advance, 1, inputs=[], outputs=[s.iteration])
         return out
 
@@ -202,8 +205,7 @@ class Descent:
 
     def hands(self) -> HandState:
         """Return the accepted hands, with joints clipped to their limits."""
-        for mine, other in zip(self._proposal_arrays(), self.state, strict=True):
-            wp.copy(mine, other)
+        self._copy_hands(self.present, self.proposed)
         found = self.proposal.state(self.n)
         hand = self.pair.hand.model
         return HandState(found.pivot, found.rotation, np.clip(found.q, hand.lower, hand.upper))

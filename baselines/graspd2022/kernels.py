@@ -11,8 +11,9 @@ that stop the object (`relax`), and the hand descends sum |f - F|^2. Points with
 
 import warp as wp
 
+from graspd.worker.simulation.kernels.kinematics import Hands
 from graspd.worker.simulation.kernels.surface import Surface, field_distance
-from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
+from graspd.worker.simulation.kernels.wrenches import add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
@@ -63,12 +64,9 @@ def force_slope(physics: ForceModel, depth: wp.float32, n: wp.vec3, v: wp.vec3):
 
 @wp.kernel
 def multipliers(
-    # Model:
     physics: ForceModel,
     wanted_in: wp.array(dtype=vec6),
-    # Data in:
     active_in: wp.array(dtype=wp.int32),
-    # Data out:
     total_inout: wp.array2d(dtype=vec6),
     lambda_inout: wp.array2d(dtype=wp.float32),
     pull_out: wp.array2d(dtype=vec6),
@@ -102,37 +100,30 @@ def force_gradient(physics: ForceModel, force: wp.vec3, wanted: wp.vec3, actual:
 
 @wp.kernel
 def relax(
-    # Model:
     physics: ForceModel,
     surface: Surface,
     velocity_in: wp.array(dtype=wp.vec3),
     point_body_in: wp.array(dtype=wp.int32),
     point_position_in: wp.array(dtype=wp.vec3),
-    # Data in:
-    active_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
-    dilation_scale_in: wp.array(dtype=wp.float32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
     pull_in: wp.array2d(dtype=vec6),
-    # Data out:
     force_inout: wp.array3d(dtype=wp.vec3),
     first_inout: wp.array3d(dtype=wp.vec3),
     largest_inout: wp.array3d(dtype=wp.vec3),
     total_inout: wp.array2d(dtype=vec6),
-    wrench_inout: Wrenches,
+    hands_inout: Hands,
 ):
     """Step every force by Adamax, then add the bodies' gradient of sum |f - F|^2. Launch over (B, N)."""
     b, i = wp.tid()
-    if active_in[b] == 0:
+    hands = hands_inout
+    if hands.active[b] == 0:
         return
-    it = iteration_in[0]
+    it = hands.iteration[0]
     body = point_body_in[i]
-    x = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], point_position_in[i])
+    x = hands.body_p[b, body] + wp.quat_rotate(hands.body_q[b, body], point_position_in[i])
     sample = field_distance(surface, x)
     n = sample.normal
-    depth = dilation_scale_in[b] * dilation_in[it] - sample.distance
+    depth = hands.dilation_scale[b] * dilation_in[it] - sample.distance
     warm = wp.min(float(it) / physics.warmup, 1.0)
     rate = warm * physics.rate / (1.0 - wp.pow(0.9, float(it + 1)))
     slope_sum = float(0.0)
@@ -162,23 +153,19 @@ def relax(
     g_distance = -slope_sum
     if g_distance != 0.0 and sample.distance < 1.0e2:
         f = g_distance * n
-        add_wrench(wrench_inout, b, body, f, wp.cross(x, f))
+        add_wrench(hands.wrench, b, body, f, wp.cross(x, f))
 
 
 @wp.kernel
 def nearest_distance(
-    # Model:
     surface: Surface,
     point_body_in: wp.array(dtype=wp.int32),
     point_position_in: wp.array(dtype=wp.vec3),
-    # Data in:
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
-    # Data out:
+    hands_in: Hands,
     least_inout: wp.array(dtype=wp.float32),
 ):
     """Compute the least distance of each hand's points from the object, by the grid. Launch over (B, N)."""
     b, i = wp.tid()
     body = point_body_in[i]
-    x = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], point_position_in[i])
+    x = hands_in.body_p[b, body] + wp.quat_rotate(hands_in.body_q[b, body], point_position_in[i])
     wp.atomic_min(least_inout, b, field_distance(surface, x).distance)

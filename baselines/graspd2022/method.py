@@ -162,8 +162,8 @@ class _Batch:
         poses.run()
         with wp.ScopedDevice(self.device):
             least = wp.full(self.n, 1e3, dtype=wp.float32)
-            points = [m.point_body, m.point_position, d.body_p, d.body_q]
-            wp.launch(kernels.nearest_distance, (self.n, POINTS), inputs=[self.grid, *points], outputs=[least])
+            given = [self.grid, m.point_body, m.point_position, d.hands]
+            wp.launch(kernels.nearest_distance, (self.n, POINTS), inputs=given, outputs=[least])
             return np.clip((least.numpy() - APART_M) / MAX_DILATION, 0.0, 1.0).astype(np.float32)
 
     def _record(self) -> Launches:
@@ -172,9 +172,8 @@ class _Batch:
         sums = [self.total, self.multiplier, self.pull, self.gap]
         out.add(kernels.multipliers, (n, 3), inputs=[self.physics, self.task, d.active], outputs=sums)
         model = [self.physics, self.grid, self.velocity, m.point_body, m.point_position]
-        state = [d.active, d.iteration, d.schedule.dilation, d.dilation_scale, d.body_p, d.body_q, self.pull]
-        forces = [self.force, self.first, self.largest, self.total, d.wrench]
-        out.add(kernels.relax, (n, POINTS), inputs=[*model, *state], outputs=forces)
+        forces = [self.force, self.first, self.largest, self.total, d.hands]
+        out.add(kernels.relax, (n, POINTS), inputs=[*model, d.schedule.dilation, self.pull], outputs=forces)
         add_self_penalty(out, m, d, 0.0)
         add_root_gradient(out, m, d)
         add_step(out, m, d, "adam", betas=BETAS)

@@ -248,11 +248,8 @@ def neighbour_state(problem: Problem, x: vec8, t: wp.float32, rng: wp.uint32):
 
 @wp.kernel
 def draw_start(
-    # Model:
     problem: Problem,
-    # In:
     tries_in: wp.int32,
-    # Data out:
     rng_inout: wp.array(dtype=wp.uint32),
     state_out: wp.array(dtype=vec8),
     energy_out: wp.array(dtype=wp.float32),
@@ -315,13 +312,10 @@ def insert_best(
 
 @wp.kernel
 def anneal(
-    # Model:
     problem: Problem,
-    # In:
     rounds_in: wp.int32,
     last_in: wp.int32,
     alike_in: wp.float32,
-    # Data out:
     step_inout: wp.array(dtype=wp.int32),
     rng_inout: wp.array(dtype=wp.uint32),
     state_inout: wp.array(dtype=vec8),
@@ -363,11 +357,8 @@ def anneal(
 
 @wp.kernel
 def unpack(
-    # Model:
     problem: Problem,
-    # Data in:
     state_in: wp.array(dtype=vec8),
-    # Data out:
     pivot_out: wp.array(dtype=wp.vec3),
     rotation_out: wp.array(dtype=wp.quat),
     q_out: wp.array2d(dtype=wp.float32),

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
+from benchmarks.integrators.reference import World
 from benchmarks.modelling.common import Bools, Floats, Row, Subject, cpu, ranking, share, verdicts
 from benchmarks.modelling.steps import forward_simulation
 from graspd.worker.control.postures import hold_forces
@@ -20,7 +21,6 @@ from graspd.worker.objects.convex import union_volume
 from graspd.worker.planners.fast_graspd.candidates import FRICTION
 from graspd.worker.quality.probe import probe_of
 from graspd.worker.quality.table import measure
-from graspd.worker.simulation.reference import World
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.model import MujocoOptions, Scene, build_scene

@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.integrators.reference import World, loss
 from graspd.service.model.transforms import quat_from_axis_angle, quat_to_matrix
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.quality.probe import Probe
 from graspd.worker.simulation.model import REFERENCE_POINTS, initial_motions
-from graspd.worker.simulation.reference import World, loss
 
 Floats = NDArray[np.float64]
 

@@ -34,6 +34,10 @@ _SEVEN = (
     "035_power_drill"
 )
 _LITTLE = "--hands barrett --objects 077_rubiks_cube --grasps 4"
+_MERGED = (
+    "graspd stability --from WORK/integrators/stability.json --from WORK/shapes/stability.json "
+    "--out OUT/results/stability"
+)
 
 
 _TRAIN = (
@@ -136,10 +140,15 @@ STUDIES: Final = (
         "failures of integrators, gradients, starts and rates",
         ("results/stability/*",),
         (
-            "graspd stability --only time_step --only stiffness --only contact_count --only gradient --only shapes "
-            "--only starts --only rates --only length --long --out OUT/results/stability",
+            "python -m benchmarks.integrators --out WORK/integrators",
+            "graspd stability --only shapes --out WORK/shapes",
+            _MERGED,
         ),
-        ("graspd stability --quick --only time_step --only gradient --only shapes --out OUT/results/stability",),
+        (
+            "python -m benchmarks.integrators --quick --only time_step gradient --out WORK/integrators",
+            "graspd stability --quick --only shapes --out WORK/shapes",
+            _MERGED,
+        ),
     ),
     Study(
         "hands-stability",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final, get_args
+from typing import Annotated, Any, Final
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -14,18 +14,16 @@ from rich.table import Table
 
 from graspd.exchange.inputs import expand_path, load_case
 from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json, write_output
-from graspd.service.model.errors import InputError, choices_text
+from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
 from graspd.service.store.shards import inherited_attributes, json_attribute, read_shard, write_shard
 from graspd.studies.engines import compare_engines, summarise
-from graspd.studies.evaluation import Protocol, combine_rows, evaluate
+from graspd.studies.evaluation import checked_level, combine_rows, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.subsets import require_empty_folder
 from graspd.worker.hands.hand_matching import TOLERANCE_M, match_hands
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.validation.engines.registry import EngineVerdicts, check_engines, engine_columns
-from graspd.worker.validation.key import Level
-from graspd.worker.validation.lifting import LiftLevel
 from graspd.worker.validation.robust import Robustness
 
 app = CommandGroup(add_completion=False)
@@ -68,7 +66,7 @@ def evaluate_command(
     json: JsonFlag = False,
 ) -> None:
     """Measure grasps (medians; ε and areas at 5 mm) and validate them in an independent engine."""
-    level = _validate_level(protocol, level)
+    level = checked_level(protocol, level)
     if robust and protocol == "displacement":
         raise InputError("--robust repeats pushes or lifts in perturbed models: use --protocol dexgraspbench or lift")
     if validation_hand is None and joint_map:
@@ -107,7 +105,7 @@ def evaluate_command(
             row = evaluate(
                 case,
                 protocol=protocol,  # type: ignore[arg-type]
-                level=level,  # type: ignore[arg-type]
+                level=level,
                 hard=hard,
                 friction=friction,
                 models=robust,
@@ -120,18 +118,6 @@ def evaluate_command(
         _report_engines(verdicts, json=json)
         return
     _report(rows, other.name if other else "", json=json)
-
-
-def _validate_level(protocol: str, level: str) -> str:
-    """Return the level, or the default of the protocol if `level` is empty.
-    Raises InputError: the protocol or the level is unknown."""
-    if protocol not in get_args(Protocol):
-        raise InputError(f"unknown protocol {protocol!r}; choose {choices_text(protocol, get_args(Protocol))}")
-    levels = get_args(LiftLevel if protocol == "lift" else Level)
-    level = level or ("lift" if protocol == "lift" else "standard")
-    if level not in levels:
-        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {choices_text(level, levels)}")
-    return level
 
 
 def _report(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:

@@ -18,6 +18,7 @@ from graspd.service.model.errors import InputError, choices_text
 from graspd.service.store import validity
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import open_store
+from graspd.service.store.usd_layers import import_usd
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, select_grasps
 
@@ -213,6 +214,25 @@ def _summary(file: Path) -> dict[str, Any]:
         "published": int((said >= 0).sum()),
         "agreement_published": agree,
     }
+
+
+@app.command(epilog="graspd simready mug.usd --grasps grasps.h5 -o mug-simready.usd")
+def simready(
+    source: Annotated[Path, typer.Argument(help="USD file of the object.")],
+    grasps: Annotated[list[Path], typer.Option(help="Base shard of the object; repeat it for several hands.")],
+    best: Annotated[int, typer.Option(min=0, help="Number of best grasps of each shard by epsilon; 0: all.")] = 10,
+    output: Annotated[Path, typer.Option("--output", "-o", help="USD file to write.")] = Path("simready.usd"),
+    json: JsonFlag = False,
+) -> None:
+    """Write the object's USD file with its valid grasps, as NVIDIA's SimReady foundation asks."""
+    import_usd()
+    from graspd.exchange.simready import write_simready
+
+    done = write_simready(source, grasps, output, best=best)
+    told = {"file": str(output), **done.counts, **({"notes": done.notes} if done.notes else {})}
+    print_result(told, f"{output}: " + ", ".join(f"{n} {what}" for what, n in done.counts.items()), json=json)
+    for note in () if json else done.notes:
+        typer.echo(note, err=True)
 
 
 @app.command(epilog="graspd datasets card kitchen -o kitchen-v1 --licence CC-BY-4.0")

@@ -20,9 +20,9 @@ from graspd.exchange.robots.execution import (
     tool_frame,
     velocity_limits,
 )
-from graspd.service.model.scene_spec import SceneSpec, scene_supports
+from graspd.service.model.scene_spec import scene_supports
 from graspd.service.model.transforms import compose, invert
-from graspd.service.readers.trajectories import Waypoint, scene_spec_of, trajectory_of, wrist_angles
+from graspd.service.readers.trajectories import Waypoint, planned_scene_of, trajectory_of, wrist_angles
 from graspd.service.store.shards import Shard
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.provenance import neighbours_of_shard, scenes_of_shard
@@ -65,7 +65,7 @@ class GraspSheet:
 
     @property
     def scene(self) -> str:
-        spec = _scene_of(self.shard)
+        spec = planned_scene_of(self.shard)
         return "" if spec is None else spec.kind
 
     def png(self, *, subtitle: str) -> bytes:
@@ -109,16 +109,11 @@ class GraspSheet:
 
 def surroundings_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
     """Return the surroundings of grasps of a base shard: the scenes in which they were planned, or none."""
-    if (spec := _scene_of(shard)) is None:
+    if (spec := planned_scene_of(shard)) is None:
         return PictureScenes()
     poses = np.asarray(shard["scene/object_pose"], float)
     index = np.asarray(shard["grasp/scene_index"], np.intp)[rows]
     return PictureScenes(scene_supports(spec), poses, index, neighbours_of_shard(shard, []), wrist_angles(shard, rows))
-
-
-def _scene_of(shard: Shard) -> SceneSpec | None:
-    spec = scene_spec_of(shard)
-    return None if spec is None or spec.kind == "free" or "grasp/scene_index" not in shard.arrays else spec
 
 
 def _waypoint(trajectory: list[Waypoint], name: str) -> Waypoint:

@@ -185,7 +185,11 @@ def _restore_rows(services: Services, deletion: Deletion, connection: Connection
         members = [(AssetKind.HAND, one.digest) for one in dataset.hands]
         _require_assets(services, [*members, *((AssetKind.OBJECT, one.digest) for one in dataset.objects)], connection)
         index.write_dataset.add(dataset, within=connection)
-        index.write_dataset.set_events(dataset.name, dataset_events(store, dataset.name), within=connection)
+        actions = dataset_events(store, dataset.name)
+        index.write_dataset.set_events(dataset.name, actions, within=connection)
+        # Only ended datasets are deleted: the end was reported before.
+        told = max((action.number for action in actions), default=0)
+        index.write_dataset.set_progress(dataset.name, told=told, within=connection)
         for key in _keys_below(store, names.dataset_snapshots_folder(dataset.name)):
             index.write_dataset.add_snapshot(read_record(Snapshot, store, key), within=connection)
     else:

@@ -226,7 +226,7 @@ def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
     `cause` is the dataset event that caused this, if any. ConflictError: the job has ended.
     """
     with _event_transaction(services, job_id, _refuse_ended) as add:
-        in_queue = services.index.feed.unfinished_tasks(job_id)
+        in_queue = services.index.feed.queued_tasks(job_id)
         add("cancelled", cause=cause)
     try:
         services.queue.discard(in_queue)

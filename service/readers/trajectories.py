@@ -93,3 +93,9 @@ def scene_spec_of(shard: Shard) -> SceneSpec | None:
         return SceneSpec(**from_json(str(text)))
     except (ValueError, TypeError):
         raise InputError("the shard's attribute scene is not a valid scene") from None
+
+
+def planned_scene_of(shard: Shard) -> SceneSpec | None:
+    """Return the scene in which grasps were planned, None for free ones; InputError if invalid."""
+    spec = scene_spec_of(shard)
+    return None if spec is None or spec.kind == "free" or "grasp/scene_index" not in shard.arrays else spec

@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Final, Literal
 
 from graspd.service.model.errors import InputError, LimitError
+from graspd.service.store import usd_layers
 from graspd.service.store.assets import MAX_FILES, ZipFiles
 from graspd.service.store.mesh_files import (
     HEAD_BYTES,
@@ -25,8 +26,8 @@ from graspd.service.store.mesh_files import (
 
 #: Names of a file that describes the hand besides its URDF; the first name takes precedence.
 DESCRIPTIONS: Final = ("asset.json", "hand.json")
-#: Suffixes of a hand's main file; the root element decides the format.
-SUFFIXES: Final = (".urdf", ".xacro", ".xml", ".mjcf")
+#: Suffixes of a hand's main file; in XML, the root element decides the format.
+SUFFIXES: Final = (".urdf", ".xacro", ".xml", ".mjcf", *usd_layers.SUFFIXES)
 #: Suffixes of the files taken from a folder besides its descriptions.
 _TAKEN: Final = (*SUFFIXES, ".yaml", ".yml", ".stl", ".obj", ".ply", ".off", ".glb", ".dae", ".msh")
 _REFERENCE: Final = re.compile(r"""file(?:name)?\s*=\s*["']([^"']+)["']""")
@@ -65,7 +66,7 @@ def _files_of_folder(folder: Path) -> dict[str, Path]:
     root = folder.resolve()
     files = _files_below(root, root)
     if not any(name.lower().endswith(SUFFIXES) for name in files):
-        raise InputError(f"{folder} holds no URDF, xacro or MJCF; give the folder of one hand")
+        raise InputError(f"{folder} holds no URDF, xacro, MJCF or USD; give the folder of one hand")
     return files
 
 
@@ -83,7 +84,10 @@ def _files_of_description(path: Path) -> tuple[dict[str, Path], str]:
     path = path.resolve() if path.is_file() else path
     root = _package_folder(path)
     main = path.relative_to(root).as_posix()
-    if path.is_file() and format_of(path.name, path.read_bytes()) == "xacro":
+    if path.is_file() and path.name.lower().endswith(usd_layers.SUFFIXES):
+        beside = main.removesuffix(path.name)
+        files = {f"{beside}{name}": file for name, file in usd_layers.layer_files(path).items()}
+    elif path.is_file() and format_of(path.name, path.read_bytes()) == "xacro":
         # The files that a xacro includes are unknown until its expansion.
         files = _files_below(root if (root / "package.xml").is_file() else path.parent, root)
     else:
@@ -150,7 +154,7 @@ def _is_inside(file: Path, root: Path) -> bool:
     return file.is_file() and file.resolve().is_relative_to(root.resolve())
 
 
-Format = Literal["urdf", "xacro", "mjcf"]
+Format = Literal["urdf", "xacro", "mjcf", "usd"]
 #: Size of the head that is searched for the root element [bytes].
 _HEAD_BYTES: Final = 1 << 16
 _PROLOG: Final = re.compile(r"\s*(?:<\?.*?\?>|<!--.*?-->|<!DOCTYPE(?:[^\[>]|\[.*?\])*>)", re.DOTALL)
@@ -169,6 +173,8 @@ def format_of(name: str, data: bytes) -> Format | None:
     suffix = PurePosixPath(name).suffix.lower()
     if suffix not in SUFFIXES:
         return None
+    if suffix in usd_layers.SUFFIXES:
+        return "usd"
     text = decode_text(data)
     found = _FORMATS_OF.get(_root_element(text[:_HEAD_BYTES]))
     if found == "urdf" and any(sign in _COMMENT.sub("", text) for sign in _MACROS):
@@ -197,7 +203,7 @@ def find_main_file(files: Mapping[str, bytes], wanted: str = "", *, where: str =
         return _match_main_file(wanted, [name for name in sorted(files) if name in known or name == wanted], where)
     # A file that a xacro description includes may have no macros.
     kinds_of = {name: "xacro" if name.lower().endswith(".xacro") else kind for name, kind in known.items()}
-    for chosen in ("urdf", "xacro", "mjcf"):
+    for chosen in ("urdf", "xacro", "mjcf", "usd"):
         found = [name for name, kind in kinds_of.items() if kind == chosen]
         if chosen == "urdf" and any(name.lower().endswith(".urdf") for name in found):
             found = [name for name in found if name.lower().endswith(".urdf")]
@@ -211,7 +217,7 @@ def find_main_file(files: Mapping[str, bytes], wanted: str = "", *, where: str =
                 f"{where} holds {len(found)} hand files ({names}); name one: --urdf {_shortest_name(found)}, or in a "
                 f'ZIP an asset.json with {{"file": "{_shortest_name(found)}"}}'
             )
-    raise InputError(f"{where} contains no hand file; give a URDF, xacro or MJCF, or its folder or ZIP")
+    raise InputError(f"{where} contains no hand file; give a URDF, xacro, MJCF or USD, or its folder or ZIP")
 
 
 def _match_main_file(wanted: str, known: list[str], where: str) -> str:
@@ -256,7 +262,7 @@ def hand_name(leaf: str) -> str:
 
 
 def _read_description_head(files: Mapping[str, bytes], name: str) -> bytes:
-    if PurePosixPath(name).suffix.lower() not in SUFFIXES:
+    if PurePosixPath(name).suffix.lower() not in SUFFIXES[:-4]:
         return b""
     if isinstance(files, ZipFiles) and files.size(name) > 1 << 23:
         with files.open(name) as stream:

@@ -25,8 +25,9 @@ from typing import Any, Final
 from graspd.service.model.errors import DamagedError, DamagedShard, NotFoundError
 from graspd.service.store.store import STREAM_BYTES, Stamp, Store
 
-#: Checksum lists of exports and cards, in the folder of a shard or one of the two folders above.
-CHECKSUM_LISTS: Final = ("SHA256SUMS", "checksums.sha256")
+#: Checksum list of exports and cards, in the folder of a shard or one of the two folders above; and that of graspd 0.2.
+CHECKSUMS: Final = "checksums.sha256"
+CHECKSUM_LISTS: Final = (CHECKSUMS, "SHA256SUMS")
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 _LEVELS: Final = 3
 FIX: Final = "`graspd admin store verify --repair` makes it again where that is possible"

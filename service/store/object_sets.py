@@ -5,6 +5,7 @@ from __future__ import annotations
 import posixpath
 import re
 from collections.abc import Mapping
+from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -12,8 +13,9 @@ from graspd.service.cli import load_settings
 from graspd.service.model.errors import InputError, LimitError
 from graspd.service.model.names import shorten_name
 from graspd.service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
+from graspd.service.store.usd_layers import SUFFIXES as USD
 
-SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb")
+SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb", *USD)
 #: Stems of mesh files in order of preference, if an object has several meshes: closed and cleaned scans first.
 PREFERRED: Final = ("clean", "nontextured", "textured_simple", "textured", "collision", "visual", "raw")
 #: Names of inner folders that describe the processing of a mesh, not the object.
@@ -96,11 +98,9 @@ def _preference_key(name: str) -> tuple[int, str]:
 
 
 def _unique_name(text: str, taken: Mapping[str, str]) -> str:
-    name = shorten_name(re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object", 60)
-    number = 2
-    while name in taken:
-        name, number = f"{name[:57]}-{number}", number + 1
-    return name
+    base = shorten_name(re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object", 60)
+    numbered = (f"{base[:56]}-{number}" for number in count(2))
+    return next(name for name in chain([base], numbered) if name not in taken)
 
 
 def _object_files(files: Mapping[str, bytes], mesh: str) -> dict[str, bytes]:

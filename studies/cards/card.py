@@ -15,6 +15,7 @@ from PIL import Image, ImageDraw
 from graspd.service.model.errors import InputError
 from graspd.service.pipeline.datasets.export import path_of
 from graspd.service.readers import ShardFile, Shards
+from graspd.service.store.integrity import CHECKSUMS
 from graspd.service.store.shards import open_shard
 from graspd.studies.cards.contents import Contents, ShardContents, read_shards
 from graspd.studies.cards.numbers import card_content
@@ -56,7 +57,7 @@ def write_card(
     if write_samples(contents.shards, folder / SHEET):
         plots[SHEET] = "Some of the pictures"
     card["plots"] = list(plots)
-    (folder / "checksums.sha256").write_text("".join(checksum_lines(contents)))
+    (folder / CHECKSUMS).write_text("".join(checksum_lines(contents)))
     (folder / "card.json").write_text(json.dumps(card, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
     (folder / "README.md").write_text(render_card(card, plots))
     return card

@@ -158,9 +158,10 @@ def _checked_facts(kind: AssetKind, name: str) -> dict[str, Any]:
         return dict(check_hand(files, name)["facts"])
     from graspd.worker.objects.formats import read_mesh
     from graspd.worker.objects.options import UNITS, parse_options
+    from graspd.worker.objects.prepare import main_mesh
 
     options = parse_options(files)
-    vertices = read_mesh(options.file, files[options.file]).vertices * UNITS[options.units]
+    vertices = read_mesh(*main_mesh(files, options)).vertices * UNITS[options.units]
     return {"extents_m": [float(extent) for extent in np.ptp(vertices, axis=0)]}
 
 

@@ -12,6 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from graspd.service.model.metrics import GRASP_METRICS
 from graspd.studies.cards.findings import findings
+from graspd.studies.figures import markdown_table
 from graspd.worker.quality import gate as gates
 
 Row = Mapping[str, Any]
@@ -25,6 +26,10 @@ _LEVELS: Final = {
     "standard": "MuJoCo, DexGraspBench's protocol with early termination of pushes",
     "fast": "MuJoCo with coarse physics; level standard decides cases near a limit",
 }
+#: The same for grasps planned in scenes.
+_LIFT_LEVELS: Final = {"dexgraspbench": "MuJoCo, DexGraspBench's tabletop test"} | dict.fromkeys(
+    ("standard", "fast"), "MuJoCo, lift out of the scene"
+)
 _REJECTED: Final = {
     "dropped": "rejected by the validator",
     "gate": "failed the gate",
@@ -85,12 +90,13 @@ def yaml_head(card: Row) -> dict[str, Any]:
 
 def _origins(card: Row) -> dict[str, str]:
     making, valid, threshold = card["making"], card["composition"]["valid"], card["contact_threshold_m"]
+    levels = _LIFT_LEVELS if making["scenes"] else _LEVELS
     each = ", ".join(f"{kind} {1000 * value / (valid or 1):,.0f} s" for kind, value in making["seconds"].items())
     total = making["seconds_per_1000_valid"]
     rows = {
         "method, fidelity": f"{', '.join(making['methods'])}; "
         + ", ".join(str(found.get("name", "custom")) for found in making["fidelities"]),
-        "validation": "; ".join(_LEVELS.get(level, level) for level in making["levels"]) or "none",
+        "validation": "; ".join(levels.get(level, level) for level in making["levels"]) or "none",
         "imported from": ", ".join(making["imported_from"]),
         "requirements": "; ".join(cell_text(text) for text in making["requirements"]),
         "friction of ε and Vol": ", ".join(f"{value:g}" for value in making["friction"]),
@@ -115,17 +121,17 @@ def _origins(card: Row) -> dict[str, str]:
 def quality_table(card: Row) -> str:
     """Return the distribution of each metric by hand, in Markdown."""
     hands = list(card["quality"])
-    lines = [f"| quality | {' | '.join(hands)} |", f"| --- |{' --: |' * len(hands)}"]
-    missing = []
+    rows, missing = [], []
     for metric in GRASP_METRICS:
         if metric.digits is None:
             continue
         found = [card["quality"][hand].get(metric.name) for hand in hands]
         if any(found):
-            lines.append(f"| {metric.heading} | {' | '.join(_percentile_text(one, metric.digits) for one in found)} |")
+            rows.append([metric.heading, *(_percentile_text(one, metric.digits) for one in found)])
         else:
             missing.append(metric.heading)
-    return "\n".join(lines) + (f"\n\nNot measured: {', '.join(missing)}." if missing else "")
+    table = markdown_table(" | ".join(["quality", *hands]), rows)
+    return table + (f"\n\nNot measured: {', '.join(missing)}." if missing else "")
 
 
 def _percentile_text(found: Row | None, digits: int) -> str:
@@ -157,9 +163,7 @@ def _cells_table(card: Row) -> str:
                 **({"missing because": cell_text(cell["missing_because"], "")} if reasons else {}),
             }
         )
-    names = list(rows[0])
-    lines = [names, ["---"] * 2 + ["--:"] * (len(names) - 2), *(list(row.values()) for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return markdown_table(" | ".join(rows[0]), (list(row.values()) for row in rows), left=2)
 
 
 def cell_text(text: str | None, missing: str = "not recorded") -> str:

@@ -10,10 +10,9 @@ import numpy as np
 
 from graspd.service.model.metrics import GRASP_METRICS
 from graspd.studies.cards.tally import Tally, cell_counts
+from graspd.studies.figures import COLOURS, INK, new_figure, plain_axes
 
 Row = Mapping[str, Any]
-COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
-INK: Final = "#1f2937"
 _NAMED: Final = 40  # largest number of objects of a matrix that shows names and numbers
 _PANELS: Final = 6  # largest number of panels: the first hands get one each
 #: Title, column, and whether the axis ends at the 99th percentile.
@@ -47,20 +46,8 @@ def draw(card: Row, tally: Tally, folder: Path) -> dict[str, str]:
     return written
 
 
-def _figure(width: float, height: float) -> Any:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
 def _names(card: Row, what: str) -> list[str]:
     return [asset["name"] for asset in card["composition"][what]]
-
-
-def _style_axes(axes: Any) -> None:
-    axes.grid(alpha=0.25)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _plot_yields(card: Row, tally: Tally) -> Any:
@@ -72,7 +59,7 @@ def _plot_yields(card: Row, tally: Tally) -> Any:
     if not rows:
         return None
     named = len(objects) <= _NAMED
-    figure = _figure(2.6 + 1.25 * len(hands), 1.2 + (0.3 * len(objects) if named else 8))
+    figure = new_figure(2.6 + 1.25 * len(hands), 1.2 + (0.3 * len(objects) if named else 8))
     axes = figure.add_subplot()
     image = axes.imshow(shares, cmap="YlGnBu", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     axes.set_xticks(range(len(hands)), hands)
@@ -94,7 +81,7 @@ def _plot_qualities(card: Row, tally: Tally) -> Any:
     if not shown:
         return None
     lines = -(-len(shown) // 3)
-    figure = _figure(10, 2.7 * lines + 0.4)
+    figure = new_figure(10, 2.7 * lines + 0.4)
     panels = list(figure.subplots(lines, 3, squeeze=False).flat)
     for axes, (title, name, cut) in zip(panels, shown, strict=False):
         columns = {hand: values[np.isfinite(values)] for hand in hands for values in [tally.of_hand(hand).column(name)]}
@@ -108,7 +95,7 @@ def _plot_qualities(card: Row, tally: Tally) -> Any:
                 axes.hist(np.minimum(values, top), bins, weights=weights, label=hand, **style)
         axes.set_xlabel(f"{title} (last bin: all above)" if cut else title, fontsize=9)
         axes.tick_params(labelsize=8)
-        _style_axes(axes)
+        plain_axes(axes, grid_below=True)
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     figure.supylabel("% of the hand's valid grasps", fontsize=9)
@@ -123,7 +110,7 @@ def _plot_directions(card: Row, tally: Tally) -> Any:
     if not hands:
         return None
     with_table = bool(card["elevation"])
-    figure = _figure(max(4.0, 3.6 * len(hands)), 4.9 if with_table else 2.6)
+    figure = new_figure(max(4.0, 3.6 * len(hands)), 4.9 if with_table else 2.6)
     grid = figure.add_gridspec(2 if with_table else 1, len(hands), height_ratios=[1, 1.1] if with_table else [1])
     bands, sectors = 12, 24
     latitudes = np.arcsin(np.linspace(-1, 1, bands + 1))
@@ -156,7 +143,7 @@ def _plot_elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: boo
     axes.stairs(even, edges, color=INK, linestyle="--", linewidth=1, label="uniform directions")
     axes.set_xticks([-90, -45, 0, 45, 90], ["below", "-45°", "side", "45°", "above"], fontsize=8)
     axes.tick_params(labelsize=8)
-    _style_axes(axes)
+    plain_axes(axes, grid_below=True)
     if first:
         axes.set_ylabel("pairs of grasp and scene", fontsize=9)
         axes.figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=8)
@@ -169,7 +156,7 @@ def _plot_table_scenes(card: Row, tally: Tally) -> Any:
         return None
     order = sorted(objects, key=lambda obj: (card["table"]["by_object"][obj]["of_grasps"] or {"share": 0})["share"])
     named = len(objects) <= _NAMED
-    figure = _figure(7.5, 1.3 + (0.28 * len(objects) if named else 7))
+    figure = new_figure(7.5, 1.3 + (0.28 * len(objects) if named else 7))
     axes = figure.add_subplot()
     for number, hand in enumerate(hands):
         own = [cell for cell in rows if cell["hand"] == hand]
@@ -179,7 +166,7 @@ def _plot_table_scenes(card: Row, tally: Tally) -> Any:
     axes.set_yticks(range(len(order)) if named else [], order if named else [], fontsize=8)
     axes.set_xlim(-0.02 * axes.get_xlim()[1], None)
     axes.set_xlabel("% of the valid grasps that are clear in at least one scene", fontsize=9)
-    _style_axes(axes)
+    plain_axes(axes, grid_below=True)
     figure.legend(loc="outside upper right", ncols=8, frameon=False)
     return figure
 
@@ -189,7 +176,7 @@ def _plot_joints(card: Row, tally: Tally) -> Any:
     if not hands:
         return None
     most = max(len(card["joints"][hand]) for hand in hands)
-    figure = _figure(max(5.0, 3.4 * len(hands)), 0.9 + 0.21 * most)
+    figure = new_figure(max(5.0, 3.4 * len(hands)), 0.9 + 0.21 * most)
     panels = figure.subplots(1, len(hands), squeeze=False)[0]
     for number, (axes, hand) in enumerate(zip(panels, hands, strict=True)):
         joints = card["joints"][hand]
@@ -214,7 +201,7 @@ def _plot_sizes(card: Row, tally: Tally) -> Any:
     rows = [cell for cell in card["cells"] if cell["object"] in sizes and cell["of_validated"] is not None]
     if not rows:
         return None
-    figure = _figure(9, 3.2)
+    figure = new_figure(9, 3.2)
     panels = figure.subplots(1, 3, sharey=True)
     for axes, place, what in zip(panels, range(3), ("smallest", "middle", "largest"), strict=True):
         for number, hand in enumerate(_names(card, "hands")):
@@ -225,7 +212,7 @@ def _plot_sizes(card: Row, tally: Tally) -> Any:
         axes.set_xlabel(f"{what} extent of the object, mm", fontsize=9)
         axes.tick_params(labelsize=8)
         axes.set(xlim=(0, None), ylim=(0, 103))
-        _style_axes(axes)
+        plain_axes(axes, grid_below=True)
     panels[0].set_ylabel("valid share of validated grasps, %", fontsize=9)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, frameon=False)
     return figure

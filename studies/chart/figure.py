@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.studies.chart.statistics import valid_rate_bound
+from graspd.studies.figures import COLOURS, INK, new_figure, plain_axes
 
 Row = Mapping[str, Any]
 Rows = Sequence[Row]
@@ -36,22 +37,7 @@ IN_SCENES: Final = (
 SPEED: Final = "end_to_end_per_second"
 #: Keys of accuracies that are shares.
 OF_ONE: Final = frozenset({"dexgraspbench", "hard", "robust", "lift", "lift_dexgraspbench", "lift_hard"})
-COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 MARKERS: Final = ("o", "s", "D", "^", "v", "P", "X", "<")
-INK: Final = "#1f2937"
-
-
-def new_figure(width: float, height: float) -> Any:
-    """Return an empty figure of this size [inch]."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def plain_axes(axes: Any) -> None:
-    """Add a faint grid and remove the upper and the right line."""
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
 
 
 def draw(rows: Rows, files: Sequence[Path]) -> None:

@@ -7,11 +7,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def clear_contacts(
-    # Data in:
-    active_in: wp.array(dtype=wp.int32),
-    # Data out:
-    count_out: wp.array(dtype=wp.int32),
-    near_count_out: wp.array(dtype=wp.int32),
+    active_in: wp.array(dtype=wp.int32), count_out: wp.array(dtype=wp.int32), near_count_out: wp.array(dtype=wp.int32)
 ):
     """Clear the contacts. Launch over B."""
     b = wp.tid()

@@ -11,6 +11,7 @@ from typing import Any, Final
 from graspd.service.model.studies import FILTERED, IN_SCENE, IN_SCENES
 from graspd.studies.chart.figure import SPEED, draw, draw_hands, draw_scenes, draw_sweeps, fidelity_label
 from graspd.studies.chart.statistics import valid_rate_bound
+from graspd.studies.figures import markdown_table
 
 Row = Mapping[str, Any]
 
@@ -36,6 +37,8 @@ SCENE_COLUMNS: Final = (
     *("seconds_to_first", "note"),
 )
 
+#: First columns of tables of scenes, with their number formats.
+_MODE_COLUMNS: Final = {"way": "", "method": "", "fidelity": "", "grasps": "", "clear": ".2f"}
 #: Accuracies of the summary with their number formats.
 ACCURACIES: Final = (("dexgraspbench", ".2f"), ("hard", ".2f"), ("robust", ".2f"), ("epsilon", ".3f"), ("pd_mm", ".2f"))
 
@@ -118,19 +121,19 @@ def _head(chart: Row) -> str:
 
 def summary_table(rows: Sequence[Row]) -> str:
     """Return a row per method and fidelity, the fastest first; bold if on the Pareto front."""
-    lines = [
-        "| method | fidelity | batch | valid/s | first valid s | held/s, planner only | dexgraspbench | hard | "
-        "robust | ε | penetration mm | grasps |",
-        "| --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
-    ]
+    headings = (
+        "method | fidelity | batch | valid/s | first valid s | held/s, planner only | dexgraspbench | hard | robust | "
+        "ε | penetration mm | grasps"
+    )
+    found = []
     for row in sorted(rows, key=lambda r: -r[SPEED]):
         cells = [row["method"], row["fidelity"], row["batch"], _value_with_error(row, SPEED, ".3g")]
         cells += [_format(row["seconds_to_first_valid"], ".2g"), f"{row['valid_per_second']:.3g}"]
         for key, form in ACCURACIES:
             text = _value_with_error(row, key, form)
             cells.append(f"**{text}**" if key in row["front"] else text)
-        lines.append("| " + " | ".join(map(str, [*cells, row["grasps"]])) + " |")
-    return "\n".join(lines)
+        found.append([*cells, row["grasps"]])
+    return markdown_table(headings, found, left=2)
 
 
 def _value_with_error(row: Row, key: str, form: str) -> str:
@@ -140,7 +143,7 @@ def _value_with_error(row: Row, key: str, form: str) -> str:
     return f"{row[key]:{form}} ± {half:.1g}" if form == ".3g" else f"{row[key]:{form}} ± {half:{form}}"
 
 
-def _format(value: float | None, form: str = ".2f") -> str:
+def _format(value: Any, form: str = ".2f") -> str:
     return "–" if value is None else f"{value:{form}}"
 
 
@@ -151,38 +154,34 @@ def _ratios(rows: Sequence[Row]) -> str:
     if not own or not others:
         return ""
     best = max(own, key=lambda r: r[SPEED])
-    lines = [
-        "fast_graspd at its default fidelity (*standard*), relative to each other method in the same run:",
-        "",
-        "| relative to | valid/s | dexgraspbench | ε | penetration mm |",
-        "| --- | --: | --: | --: | --: |",
-    ]
+    found = []
     for row in others:
         if row[SPEED]:
             times = f"× {best[SPEED] / row[SPEED]:.3g}"
         else:
             times = f"> × {best[SPEED] / valid_rate_bound(row):.3g} (0 of {row['grasps']} valid)"
-        lines.append(
-            f"| {row['method']} {row['fidelity']} | {times} | {best['dexgraspbench'] - row['dexgraspbench']:+.2f} "
-            f"| {best['epsilon'] - row['epsilon']:+.3f} | {best['pd_mm'] - row['pd_mm']:+.2f} |"
-        )
-    return "\n".join(lines)
+        forms = {"dexgraspbench": "+.2f", "epsilon": "+.3f", "pd_mm": "+.2f"}
+        gains = [f"{best[key] - row[key]:{form}}" for key, form in forms.items()]
+        found.append([f"{row['method']} {row['fidelity']}", times, *gains])
+    head = "fast_graspd at its default fidelity (*standard*), relative to each other method in the same run:"
+    return f"{head}\n\n{markdown_table('relative to | valid/s | dexgraspbench | ε | penetration mm', found)}"
 
 
 def runs_table(runs: Sequence[Row]) -> str:
     """Return a row per run, by hand and object."""
-    lines = [
-        "| hand | object | method | fidelity | valid/s | dexgraspbench | hard | robust | ε | penetration mm | "
-        "self mm | contact cm² |",
-        "| --- | --- | --- | --- | --: | --: | --: | --: | --: | --: | --: | --: |",
-    ]
-    lines += [
-        f"| {run['hand']} | {run['object']} | {run['method']} | {run['fidelity']} | {run[SPEED]:.3g} "
-        f"| {run['dexgraspbench']:.2f} | {run['hard']:.2f} | {_format(run['robust'])} | {run['epsilon']:.3f} | "
-        f"{run['pd_mm']:.2f} | {run['spd_mm']:.2f} | {run['ca_cm2']:.1f} |"
-        for run in sorted(runs, key=lambda r: (r["hand"], r["object"]))
-    ]
-    return "\n".join(lines)
+    headings = (
+        "hand | object | method | fidelity | valid/s | dexgraspbench | hard | robust | ε | penetration mm | self mm | "
+        "contact cm²"
+    )
+    columns = {"hand": "", "object": "", "method": "", "fidelity": "", SPEED: ".3g", **dict(ACCURACIES)}
+    columns |= {"spd_mm": ".2f", "ca_cm2": ".1f"}
+    ordered = sorted(runs, key=lambda run: (run["hand"], run["object"]))
+    return markdown_table(headings, (_cells(run, columns) for run in ordered), left=4)
+
+
+def _cells(row: Row, columns: Mapping[str, str]) -> list[str]:
+    """Return values of a row as texts; `columns` has their number formats, empty for names and counts."""
+    return [_format(row[key], form) for key, form in columns.items()]
 
 
 def best_table(runs: Sequence[Row]) -> str:
@@ -190,17 +189,12 @@ def best_table(runs: Sequence[Row]) -> str:
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for run in runs:
         groups.setdefault((run["hand"], run["method"], run["fidelity"]), []).append(run["best"])
-    lines = [
-        "| hand | method | fidelity | CA cm² ↑ | IV cm³ ↓ | ε ↑ | Vol ↑ | SD cm ↓ |",
-        "| --- | --- | --- | --: | --: | --: | --: | --: |",
+    columns = {"ca_cm2": ".1f", "iv_cm3": ".2f", "epsilon": ".3f", "wrench_volume": ".2f", "sd_cm": ".2f"}
+    found = [
+        [*names, *(f"{_mean(rows, key):{form}}" for key, form in columns.items())]
+        for names, rows in sorted(groups.items())
     ]
-    for (hand, method, fidelity), rows in sorted(groups.items()):
-        mean = {key: _mean(rows, key) for key in ("ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "sd_cm")}
-        lines.append(
-            f"| {hand} | {method} | {fidelity} | {mean['ca_cm2']:.1f} | {mean['iv_cm3']:.2f} | {mean['epsilon']:.3f} "
-            f"| {mean['wrench_volume']:.2f} | {mean['sd_cm']:.2f} |"
-        )
-    return "\n".join(lines)
+    return markdown_table("hand | method | fidelity | CA cm² ↑ | IV cm³ ↓ | ε ↑ | Vol ↑ | SD cm ↓", found, left=3)
 
 
 def _mean(rows: Sequence[Row], key: str) -> float:
@@ -210,17 +204,13 @@ def _mean(rows: Sequence[Row], key: str) -> float:
 
 def sweeps_table(sweeps: Sequence[Row]) -> str:
     """Return a row per value of a setting: speed and accuracy, and the speed relative to the default."""
-    lines = [
-        "| setting | value | s/grasp | speed | GSR | ε | penetration mm |",
-        "| --- | --- | --: | --: | --: | --: | --: |",
-    ]
-    lines += [
-        f"| {row['knob']} | {row['value']}{' (default)' if row['default'] else ''} "
-        f"| {1.0 / row['grasps_per_second']:.3g} | × {row['speedup']:.2f} | {_value_with_error(row, 'gsr', '.2f')} "
-        f"| {_value_with_error(row, 'epsilon', '.3f')} | {_value_with_error(row, 'pd_mm', '.2f')} |"
-        for row in sweeps
-    ]
-    return "\n".join(lines)
+    found = []
+    for row in sweeps:
+        cells = [row["knob"], f"{row['value']}{' (default)' if row['default'] else ''}"]
+        cells += [f"{1.0 / row['grasps_per_second']:.3g}", f"× {row['speedup']:.2f}"]
+        accuracies = (("gsr", ".2f"), ("epsilon", ".3f"), ("pd_mm", ".2f"))
+        found.append([*cells, *(_value_with_error(row, key, form) for key, form in accuracies)])
+    return markdown_table("setting | value | s/grasp | speed | GSR | ε | penetration mm", found, left=2)
 
 
 def time_unit(chart: Row) -> str:
@@ -272,23 +262,21 @@ def _scene_head(chart: Row) -> str:
 
 
 def _scene_summary_table(rows: Sequence[Row], second: str) -> str:
-    lines = [
-        "| mode | method | fidelity | candidates | clear | lifted | dexgraspbench | half friction | robust | "
-        f"lifted per {second} | planner only | {second}s to the first lift | pairs with a lift | × filtered |",
-        "| --- | --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
-    ]
-    lines += [
-        f"| {row['way']} | {row['method']} | {row['fidelity']} | {row['grasps']} | {row['clear']:.2f} | "
-        f"{' | '.join(_bold(row, key) for key in IN_SCENES)} | {row[SPEED]:.3g} | {row['valid_per_second']:.3g} | "
-        f"{_format(row['seconds_to_first'], '.2g')} | {row['pairs_with_one']} of {row['pairs']} | "
-        f"{_format(row['gain'], '.3g')} |"
-        for row in rows
-    ]
+    headings = (
+        "mode | method | fidelity | candidates | clear | lifted | dexgraspbench | half friction | robust | "
+        f"lifted per {second} | planner only | {second}s to the first lift | pairs with a lift | × filtered"
+    )
+    found = []
+    for row in rows:
+        speeds = _cells(row, {SPEED: ".3g", "valid_per_second": ".3g", "seconds_to_first": ".2g"})
+        pairs = f"{row['pairs_with_one']} of {row['pairs']}"
+        lifts = [_bold(row, key) for key in IN_SCENES]
+        found.append([*_cells(row, _MODE_COLUMNS), *lifts, *speeds, pairs, _format(row["gain"], ".3g")])
     note = (
         "× filtered: median ratio of planner-only speeds, in the scene to filtered, over pairs with lifted filtered "
         "grasps. Bold: no faster setting is better."
     )
-    return "\n".join(lines) + f"\n\n{note}"
+    return f"{markdown_table(headings, found, left=3)}\n\n{note}"
 
 
 def _bold(row: Row, key: str) -> str:
@@ -296,15 +284,9 @@ def _bold(row: Row, key: str) -> str:
 
 
 def _scene_runs_table(runs: Sequence[Row], second: str) -> str:
-    lines = [
-        "| hand | object | mode | method | fidelity | candidates | clear | lifted | dexgraspbench | half friction | "
-        f"robust | lifted per {second} |",
-        "| --- | --- | --- | --- | --- | --: | --: | --: | --: | --: | --: | --: |",
-    ]
-    lines += [
-        f"| {run['hand']} | {run['object']} | {run['way']} | {run['method']} | {run['fidelity']} | {run['grasps']} | "
-        f"{run['clear']:.2f} | {run['lift']:.2f} | {run['lift_dexgraspbench']:.2f} | {run['lift_hard']:.2f} | "
-        f"{_format(run['robust'])} | {run[SPEED]:.3g} |"
-        for run in runs
-    ]
-    return "\n".join(lines)
+    headings = (
+        "hand | object | mode | method | fidelity | candidates | clear | lifted | dexgraspbench | half friction | "
+        f"robust | lifted per {second}"
+    )
+    columns = {"hand": "", "object": "", **_MODE_COLUMNS, **dict.fromkeys(IN_SCENES, ".2f"), SPEED: ".3g"}
+    return markdown_table(headings, (_cells(run, columns) for run in runs), left=5)

@@ -18,6 +18,7 @@ from graspd.service.model.studies import (
     format_tick,
     tick_position,
 )
+from graspd.studies.figures import markdown_table, new_figure
 
 #: Colours (fill, text) by outcome, distinguishable by lightness alone.
 COLOURS: Final = {
@@ -51,8 +52,8 @@ def markdown(found: Stability) -> str:
     for one in found.maps:
         lines += [f"## {one.title}", "", f"![{one.title}](stability-{one.name}.png)", ""]
         lines += [f"Value of a cell: {one.measure}. {one.bounds[0].upper()}{one.bounds[1:]}.", ""]
-        lines += ["| panel | good | weak | broken | refused |", "| --- | --: | --: | --: | --: |"]
-        lines += [f"| {panel} | {_row(one.panel_cells(panel))} |" for panel in one.panels]
+        panels = ([panel, *_counts(one.panel_cells(panel))] for panel in one.panels)
+        lines += [markdown_table("panel | good | weak | broken | refused", panels)]
         lines += ["", f"- symptom: {one.shows}", f"- guard: {one.guard}"]
         if one.guard_test:
             lines.append(f"- test of the guard: `{one.guard_test}`")
@@ -69,17 +70,17 @@ def _unguarded_failures(maps: Sequence[StabilityMap]) -> list[str]:
     for one in maps:
         broken = one.broken_cell_lines()
         seen = one.shows if broken else "–"
-        lines.append(f"| {one.title} | {_row(one.reached())} | {'<br>'.join(broken) or 'nothing'} | {seen} |")
+        counts = " | ".join(_counts(one.reached()))
+        lines.append(f"| {one.title} | {counts} | {'<br>'.join(broken) or 'nothing'} | {seen} |")
     return [*lines, ""]
 
 
-def _row(cells: Sequence[MapCell]) -> str:
-    return " | ".join(str(number) for number in count_outcomes(cells).values())
+def _counts(cells: Sequence[MapCell]) -> list[str]:
+    return list(map(str, count_outcomes(cells).values()))
 
 
 def draw(one: StabilityMap, path: Path) -> None:
     """Plot a map with a square per cell."""
-    from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
     panels = one.panels
@@ -87,7 +88,7 @@ def draw(one: StabilityMap, path: Path) -> None:
     rows = math.ceil(len(panels) / columns)
     tallest = max(len({cell.y for cell in one.panel_cells(panel)}) for panel in panels)
     height = min(3.4, 1.0 + 0.5 * tallest)
-    figure = Figure(figsize=(max(4.4 * columns, 7.0), height * rows + 0.9), layout="constrained")
+    figure = new_figure(max(4.4 * columns, 7.0), height * rows + 0.9)
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes, panel in zip(grid.flat, panels, strict=False):
         _panel(axes, one, panel)

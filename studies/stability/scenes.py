@@ -94,7 +94,7 @@ _STUDIES: Final = {
         "cubes of different sizes relative to the hand's span",
         ("side of the cube over the hand's span", "scene"),
         lambda hand, ratio, kind: (3 * (1e3 * ratio * span_of(hand),), SceneSpec(kind=kind)),
-        "test_a_cube_that_does_not_fit_its_bin_is_refused",
+        "test_refused_scenes_are_cells_that_say_why_walls_stand_off",
         "uploaded objects can have such shapes",
     ),
 }

@@ -8,9 +8,8 @@ from itertools import product
 from typing import Any, Final
 
 from graspd.service.model.studies import StabilityMap, mark_reachable
-from graspd.studies.stability import assets, descents, gradients, integrators, model_errors, scenes
+from graspd.studies.stability import assets, model_errors, scenes
 from graspd.studies.stability.assets import BOUNDS, FAMILIES, MEASURE, SHOWS, MapOptions, shape_cell
-from graspd.studies.stability.descents import Say
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
@@ -22,19 +21,15 @@ ALL_HANDS: Final = ("allegro", "barrett", "shadow")  # hands for effects of diff
 
 
 def run_studies(
-    names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, work: ExecutionContext, say: Say
+    names: Sequence[str], hand: str, obj: str, *, quick: bool, work: ExecutionContext, say: Callable[[str], None]
 ) -> list[StabilityMap]:
     """Return the maps of the named studies; `say` receives a line per cell."""
     model, thing = hand_from_path(hand), object_from_path(obj)
-
-    def few(values: Sequence[float]) -> Sequence[float]:
-        return values[1::2] if quick else values
 
     def hands_to_compare(names: Sequence[str]) -> list[HandModel]:
         return [model] if quick else [model, *(hand_from_path(name) for name in names if name != model.name)]
 
     options = MapOptions(4 if quick else 8, "draft" if quick else "standard", work, say)
-    counted: dict[str, Any] = {"count": options.count, "say": say}
     few_errors = replace(options, count=2 if quick else 16)
     in_scenes = replace(options, count=2 if quick else 8, fidelity="draft")
 
@@ -43,16 +38,7 @@ def run_studies(
             name, hands_to_compare(OTHER_HANDS), in_scenes, xs=few[0] if quick else xs, ys=few[1] if quick else ys
         )
 
-    lengths = descents.LENGTHS[:1] if quick else (*descents.LENGTHS, *((descents.LONG,) if long else ()))
     studies: dict[str, Callable[[], StabilityMap]] = {
-        "time_step": lambda: integrators.time_step_map(few(integrators.TIME_STEPS), few(integrators.SPEEDS)),
-        "stiffness": lambda: integrators.stiffness_map(
-            few(integrators.STIFFNESSES), few(integrators.MASSES), few(integrators.TIME_STEPS)
-        ),
-        "contact_count": lambda: integrators.contact_count_map(integrators.COUNTS[:: 2 if quick else 1]),
-        "gradient": lambda: gradients.gradient_map(
-            few(gradients.SIZES_M), few(gradients.GAPS), repeats=1 if quick else 3
-        ),
         "shapes": lambda: assets.shape_map(
             model,
             options,
@@ -61,11 +47,6 @@ def run_studies(
             # Grasps on an open mesh cost more than the rest of a quick run.
             defects=assets.CLOSED if quick else tuple(assets.DEFECTS),
         ),
-        "starts": lambda: descents.start_map(model, thing, **counted),
-        "rates": lambda: descents.rate_map(
-            model, thing, rates=few(descents.RATES), weights=few(descents.WEIGHTS), **counted
-        ),
-        "length": lambda: descents.length_map(model, thing, lengths=lengths, say=say),
         "hands": lambda: assets.hand_map(
             options,
             fingers=(1, 3) if quick else assets.FINGERS,

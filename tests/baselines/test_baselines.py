@@ -52,7 +52,7 @@ def contacts_at(points: list[list[float]]) -> np.ndarray:
     places = np.zeros((len(found.candidates), 3))
     places[:4] = np.array(points) - pivot
     found.candidate_position.assign(places)
-    found.new_contact.assign([[0, 1, 2, 3]])
+    found.proposed.contact.assign([[0, 1, 2, 3]])
     return evaluated(found, pivot)
 
 

@@ -13,8 +13,9 @@ from graspd.service.settings import GONE, Settings
 from tests.conftest import PACKAGES, REPOSITORY
 
 
-def test_every_fault_in_the_table_has_its_test() -> None:
-    named = re.findall(r"`(tests/[\w/]+\.py)(?:::(\w+))?`", (REPOSITORY / "ARCHITECTURE.md").read_text())
+def test_every_test_that_a_page_names_is_there() -> None:
+    pages = [REPOSITORY / "ARCHITECTURE.md", *REPOSITORY.glob("docs/**/*.md")]
+    named = [one for page in pages for one in re.findall(r"`(tests/[\w/]+\.py)(?:::(\w+))?`", page.read_text())]
     assert len(named) >= 15
     for file, test in named:
         assert f"def {test}" in (REPOSITORY / file).read_text(), f"{file}::{test}"

@@ -260,6 +260,7 @@ def test_the_card_of_a_dataset_says_where_its_grasps_are_valid(tmp_path: Path) -
     assert (made.card["making"]["scenes"], made.card["making"]["neighbours"]) == (["bin"], ["mug"])
     assert made.card["validity"]["lift_hard"]["share"] == pytest.approx(0.5, abs=0.02)
     assert "valid grasps in scenes (bin with neighbours mug) of 2 robot hands" in made.page
+    assert "| validation | MuJoCo, lift out of the scene |" in made.page
     assert "At half friction 50 % of them are also lifted." in made.page
     # What is said of free grasps is not said of these.
     assert "planned around a free object" not in made.page and "clearance of the table (no scenes)" not in made.page

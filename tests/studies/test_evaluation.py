@@ -3,6 +3,7 @@
 import json
 import re
 import time
+from typing import Any
 
 import h5py
 import numpy as np
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 
 from benchmarks import learned
 from benchmarks.cells import planned
+from benchmarks.integrators.reference import Contacts, World, direct
 from benchmarks.modelling.common import auc, ranking
 from benchmarks.modelling.drops import drops, forearm
 from benchmarks.modelling.steps import forward_simulation, step
@@ -19,6 +21,7 @@ from graspd.baselines.learned.network import save
 from graspd.commands.evaluate import app
 from graspd.exchange.inputs import Case, expand_path, load_case
 from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.transforms import apply, invert
 from graspd.service.store.shards import read_shard, write_shard
@@ -38,7 +41,6 @@ from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.probe import probe_of
 from graspd.worker.rendering import render
 from graspd.worker.scenes import drop
-from graspd.worker.simulation.reference import Contacts, World, direct
 from tests.conftest import REPOSITORY
 from tests.networks import random_network
 from tests.worker.commands_run import graspd, refused
@@ -82,6 +84,12 @@ def test_what_holds_is_validated_in_other_models_when_asked(tmp_path) -> None:
     assert whole["robust_share"] == pytest.approx(row["robust_share"] / 3, abs=1e-6)
     assert whole["robust_axes"] == {axis: {"share": one["share"], "n": 2 * one["n"]} for axis, one in axes.items()}
     assert "robust_share" not in evaluate(plates_case(), cache=tmp_path)
+
+
+@pytest.mark.parametrize("protocol, level", [("lift", "standard"), ("dexgraspbench", "lift"), ("push", "")])
+def test_a_level_that_the_protocol_lacks_is_refused(protocol: Any, level: str) -> None:
+    with pytest.raises(InputError, match=r"unknown (level|protocol)"):
+        evaluate(plates_case(), protocol=protocol, level=level)
 
 
 def test_published_results_agree_where_they_are_known(tmp_path) -> None:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.integrators import descents, flights, gradients
+from benchmarks.integrators.__main__ import MAPS, measure
 from graspd.commands.studies import STUDIES
 from graspd.commands.synth import _format_summary
 from graspd.service.model.domain import JobRequest
@@ -20,7 +22,7 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.studies import MapCell, Stability, StabilityMap, grade, parse_stability
 from graspd.service.store.records import latest_record
 from graspd.service.store.store import open_store
-from graspd.studies.stability import assets, descents, gradients, integrators, scenes, studies
+from graspd.studies.stability import assets, scenes, studies
 from graspd.studies.stability.assets import Coupling, MapOptions, ring_hand
 from graspd.studies.stability.model_errors import ERRORS, model_error_map
 from graspd.studies.stability.report import markdown, write
@@ -72,20 +74,20 @@ def pair(hand: HandModel) -> Pair:
 @pytest.mark.parametrize("name", ["direct (default)", "Gauss-Seidel, one sweep", "Jacobi, averaged"])
 def test_planners_own_step_lies_where_its_integrators_are_good(name: str) -> None:
     way = LossOptions().step  # time step x speed [m]
-    energy, sunk = integrators.simulate_position_based(integrators.SOLVERS[name], dt=1e-3, speed=way / 1e-3)
-    assert grade(energy, *integrators.ENERGY) == grade(sunk, *integrators.SINK_M) == "good"
+    energy, sunk = flights.simulate_position_based(flights.SOLVERS[name], dt=1e-3, speed=way / 1e-3)
+    assert grade(energy, *flights.ENERGY) == grade(sunk, *flights.SINK_M) == "good"
 
 
 @pytest.mark.parametrize(("share", "holds"), [(0.3, True), (2.5, False)])
 def test_a_penalty_force_blows_up_above_the_bound_of_theory(share: float, holds: bool) -> None:
     stiffness, mass = 1e5, 1.0
     bound = 2 * math.sqrt(mass / stiffness)  # of semi-implicit Euler on one spring
-    energy, _ = integrators.simulate_force_based(dt=share * bound, speed=0.05, stiffness=stiffness, mass=mass)
-    assert (energy < integrators.ENERGY[1]) is holds
+    energy, _ = flights.simulate_force_based(dt=share * bound, speed=0.05, stiffness=stiffness, mass=mass)
+    assert (energy < flights.ENERGY[1]) is holds
 
 
 def test_summed_jacobi_overshoots_with_the_number_of_contacts() -> None:
-    found = integrators.contact_count_map(counts=(1, 64))
+    found = flights.contact_count_map(counts=(1, 64))
     outcome = {(cell.panel, cell.x): cell.outcome for cell in found.cells if cell.y == 0.0}
     assert (outcome["Jacobi, summed", 1], outcome["Jacobi, summed", 64]) == ("good", "broken")
     assert outcome["Jacobi, averaged", 64] == outcome["direct (default)", 64] == "good"
@@ -127,10 +129,16 @@ def test_a_long_run_does_not_drift(pair: Pair) -> None:
 @pytest.mark.slow
 def test_a_quick_run_takes_less_than_the_minute_that_it_promises() -> None:
     started = time.process_time()
-    options = {"quick": True, "long": False, "work": DEFAULT_CONTEXT, "say": lambda line: None}
+    options = {"quick": True, "work": DEFAULT_CONTEXT, "say": lambda line: None}
     found = studies.run_studies(STUDIES, "allegro", "block", **options)
     assert time.process_time() - started < 60  # CPU seconds: others may keep the machine busy
     assert [one.name for one in found] == list(STUDIES) and all(one.cells for one in found)
+
+
+@pytest.mark.slow
+def test_every_map_of_the_benchmark_has_cells() -> None:
+    found = measure(MAPS, quick=True, say=lambda line: None)
+    assert [one.name for one in found] == list(MAPS) and all(one.cells for one in found)
 
 
 def a_map(**changes: object) -> StabilityMap:

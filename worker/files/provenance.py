@@ -26,6 +26,7 @@ from graspd.service.store.columns import Attribute
 from graspd.service.store.library import load_asset_files
 from graspd.service.store.shards import Shard, json_attribute
 from graspd.service.store.store import open_store
+from graspd.service.store.usd_layers import SUFFIXES as USD
 from graspd.worker.grasps import Columns
 from graspd.worker.hands.load import files_from_path as hand_files
 from graspd.worker.hands.load import hand_from_path, load_hand
@@ -39,7 +40,7 @@ from graspd.worker.scenes.neighbours import Neighbours
 from graspd.worker.scenes.placement import neighbour_of
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 
-SUFFIXES: Final = {AssetKind.HAND: (".urdf", ".xml", ".zip"), AssetKind.OBJECT: (*READERS, ".zip")}
+SUFFIXES: Final = {AssetKind.HAND: (".urdf", ".xml", *USD, ".zip"), AssetKind.OBJECT: (*READERS, ".zip")}
 #: Largest number of files searched in the shard's folder and its subfolders.
 LOOKED_AT: Final = 200
 _FILES: Final[dict[AssetKind, Callable[[Path], tuple[str, dict[str, bytes], dict[str, Any]]]]] = {

@@ -1,4 +1,4 @@
-"""Common, checked result of the URDF and MJCF readers: links with shapes, and a tree of joints."""
+"""Common, checked result of the URDF, MJCF and USD readers: links with shapes, and a tree of joints."""
 
 from __future__ import annotations
 
@@ -124,7 +124,8 @@ def build_robot(
             raise HandError(faults[0])
         raise HandError(f"{filename}: no moving joint; a hand needs at least one revolute or prismatic joint")
     if not any(link.shapes for link in link_of.values()):
-        add = "add <collision> elements" if fmt == "URDF" else "give geoms a contype and conaffinity"
+        fixes = {"MJCF": "give geoms a contype and conaffinity", "USD": "apply PhysicsCollisionAPI to meshes"}
+        add = fixes.get(fmt, "add <collision> elements")
         raise HandError(f"{filename}: no link has collision geometry, so nothing can touch; {add}")
     return Robot(name, link_of, joint_of, root, tuple(notes), fmt, tendons or {})
 

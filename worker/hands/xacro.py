@@ -6,25 +6,21 @@ and commands: see `worker.hands.xacro_child`."""
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Final
 
 from graspd.service.model.errors import HandError
 from graspd.service.store.hand_files import decode_text, format_of
+from graspd.service.store.usd_layers import SUFFIXES as USD
 from graspd.worker.hands.robot import Robot
 from graspd.worker.hands.urdf import MAX_BYTES, read_urdf
 from graspd.worker.objects.format_check import check_format
+from graspd.worker.objects.isolation import run_isolated
 
 #: CPU time limit [s]; the largest hands on arms need a tenth of it.
 CPU_LIMIT_S: Final = 10
 MEMORY_LIMIT_BYTES: Final = 2**30
-#: Wall time limit [s], which ends a child that waits without computing.
-_WALL_LIMIT_S: Final = 1800.0
 #: Suffixes of files that an expansion may read; of other files it gets only the names.
 _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 
@@ -44,23 +40,9 @@ def expand_xacro(files: Mapping[str, bytes], main: str, arguments: Mapping[str, 
             name: decode_text(files[name]) for name in sorted(files) if PurePosixPath(name).suffix.lower() in _READ
         },
     }
-    passed_on = {name: os.environ[name] for name in ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH") if name in os.environ}
+    done = run_isolated("graspd.worker.hands.xacro_child", data=json.dumps(given).encode(), what=main)
     try:
-        done = subprocess.run(
-            [sys.executable, "-m", "graspd.worker.hands.xacro_child"],
-            input=json.dumps(given).encode(),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            timeout=_WALL_LIMIT_S,
-            check=False,
-            env={**passed_on, "PYTHONHASHSEED": "0"},
-        )
-    except subprocess.TimeoutExpired:
-        raise TimeoutError(f"{main}: expanding it did not end in {_WALL_LIMIT_S:.0f} s; try again") from None
-    if done.returncode == -signal.SIGKILL:
-        raise OSError(f"expanding {main} was killed; the machine may lack memory")
-    try:
-        answer = json.loads(done.stdout)
+        answer = json.loads(done)
         urdf, error = answer["urdf"], answer["error"]
     except (ValueError, KeyError, TypeError):
         raise HandError(
@@ -74,6 +56,10 @@ def expand_xacro(files: Mapping[str, bytes], main: str, arguments: Mapping[str, 
 
 def read_robot(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str] | None = None) -> Robot:
     """Read and check the description `main` among a hand's files; its root element determines the format."""
+    if main.lower().endswith(USD):
+        from graspd.worker.hands.usd import read_usd
+
+        return read_usd(files, main)
     check_format(main, files[main], HandError)
     match format_of(main, files[main]):
         case "mjcf":

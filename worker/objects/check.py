@@ -10,7 +10,7 @@ import numpy as np
 from graspd.service.model.errors import InputError
 from graspd.service.model.object_options import ObjectOptions
 from graspd.worker.objects.options import parse_options
-from graspd.worker.objects.prepare import apply_options, build_model, main_file, repaired_mesh
+from graspd.worker.objects.prepare import apply_options, build_model, main_mesh, repaired_mesh
 from graspd.worker.objects.repair import RepairedMesh
 
 #: Simplification bound of the prepared mesh in the report [m]: that of the standard fidelity.
@@ -29,8 +29,7 @@ def check_object(
     `lengths_m`, the longest extent in each unit [m]."""
     try:
         settings = parse_options(files, options)
-        main = main_file(files, settings)
-        mesh = repaired_mesh(main, files[main], settings)
+        mesh = repaired_mesh(*main_mesh(files, settings), settings)
         facts = _facts(mesh, face_error_m, settings)
     except InputError as error:
         return {"verdict": "refuse", "message": str(error), "repairs": [], "facts": getattr(error, "facts", {})}
@@ -61,7 +60,7 @@ def _facts(mesh: RepairedMesh, face_error_m: float, options: ObjectOptions) -> d
         "extents_m": [float(extent) for extent in extents],
         "volume_m3": model.volume,
         "mass_kg": model.mass,
-        "mass_stated": options.mass is not None or options.density is not None,
+        "mass_stated": bool((options.mass or options.density) or mesh.matter.keys() - {"friction"}),
         "friction": model.friction,
         "centre_of_mass_m": [float(value) for value in model.centre_of_mass],
         "origin_distance_m": away,

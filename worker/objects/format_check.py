@@ -29,7 +29,7 @@ _TEXTS: Final = (
     (rb'\{\s*"', "a JSON document", "download the file itself"),
     (rb"ISO-10303-21", "a STEP file", _MESH),
     (rb"#VRML", "a VRML file", _MESH),
-    (rb"#usda", "a USD file", _MESH),
+    (rb"#usda", "a USD file", "name it .usd"),
 )
 #: The same for binary files.
 _BINARIES: Final = (
@@ -38,7 +38,7 @@ _BINARIES: Final = (
     (rb"\x89PNG|\xff\xd8\xff|GIF8", "a picture", "give the file itself"),
     (rb"Kaydara FBX", "an FBX file", _MESH),
     (rb"BLENDER[-_v]", "a Blender file", _MESH),
-    (rb"PXR-USDC", "a USD file", _MESH),
+    (rb"PXR-USDC", "a USD file", "name it .usd"),
 )
 #: Git's text for a link on a file system without links: a path without a line end.
 _LINK: Final = re.compile(rb"[\w.~ /\\-]*[/\\][\w.~ -]+\.\w{1,5}")

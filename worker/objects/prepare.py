@@ -22,10 +22,12 @@ from graspd.service.model.errors import MeshError, NotFoundError, did_you_mean
 from graspd.service.model.object_options import ObjectOptions
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats
+from graspd.service.store import usd_layers
 from graspd.service.store.assets import builtin_files, builtin_names, unpack_file
 from graspd.worker.objects import disk_cache, mesh_geometry, topology
 from graspd.worker.objects.distance import MeshDistance, deviation, surface_points
 from graspd.worker.objects.formats import READERS, read_mesh
+from graspd.worker.objects.formats.usd import stage_package
 from graspd.worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
 from graspd.worker.objects.model import Ints, ObjectModel
 from graspd.worker.objects.options import OF_MATTER, parse_options
@@ -42,19 +44,24 @@ _LIBRARIES: Final = ("numpy", "scipy", "manifold3d", "fast-simplification")
 def load_object(
     files: Mapping[str, bytes], *, name: str, digest: str, face_error_m: float, options: Mapping[str, Any] | None = None
 ) -> ObjectModel:
-    """Load the object in `files`: a mesh (STL, OBJ, PLY, OFF, GLB or DAE), and optionally `asset.json`.
+    """Load the object in `files`: a mesh (`READERS`), and optionally `asset.json`.
     `digest` is that of the files; `options` override keys of `asset.json` (`ObjectOptions`). The prepared surface lies
     within `face_error_m` of the uploaded one [m]; 0 keeps all faces. Raises MeshError: the mesh cannot be used; the
     message names the fault and the fix."""
     settings = parse_options(files, options)
-    main = main_file(files, settings)
+    main, data = main_mesh(files, settings)
     shape = settings.model_dump_json(exclude=set(OF_MATTER))
-    model = replace(_prepare(main, files[main], shape, float(face_error_m)), name=name, digest=digest)
+    model = replace(_prepare(main, data, shape, float(face_error_m)), name=name, digest=digest)
     return apply_options(model, settings)
 
 
 def apply_options(model: ObjectModel, options: ObjectOptions) -> ObjectModel:
     return model.with_mass(mass=options.mass, density=options.density, friction=options.friction)
+
+
+def main_mesh(files: Mapping[str, bytes], options: ObjectOptions) -> tuple[str, bytes]:
+    """Return name and content of the mesh file; layers of a USD stage become one package."""
+    return stage_package(files, main_file(files, options))
 
 
 def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
@@ -122,7 +129,7 @@ def build_model(mesh: RepairedMesh, face_error_m: float) -> ObjectModel:
         repairs=mesh.repairs,
         parts=mesh.parts,
     )
-    return middle.place_at(mesh.centre)
+    return middle.with_mass(**mesh.matter).place_at(mesh.centre)
 
 
 def convex_hull(points: Floats) -> tuple[Floats, Ints]:
@@ -158,10 +165,11 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
         raise NotFoundError(f"{path} is neither a file nor a built-in object ({', '.join(known)}){meant}")
     if path.suffix.lower() == ".zip":
         return path.stem, unpack_file(path), {}
-    files, beside = {path.name: path.read_bytes()}, path.with_name("asset.json")
-    if not beside.is_file():
-        return object_name(path), files, {}
-    return object_name(path), files | {beside.name: beside.read_bytes()}, {"file": path.name}
+    found = usd_layers.layer_files(path) if path.suffix.lower() in usd_layers.SUFFIXES else {path.name: path}
+    if (beside := path.with_name("asset.json")).is_file():
+        found[beside.name] = beside
+    files = {name: file.read_bytes() for name, file in found.items()}
+    return object_name(path), files, {"file": path.name} if len(files) > 1 else {}
 
 
 def object_name(path: Path) -> str:

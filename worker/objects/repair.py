@@ -5,7 +5,8 @@ Every change is reported: after silent repairs, results of a dataset could not b
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -59,6 +60,7 @@ class RepairedMesh:
     moved_m: float = 0.0  # largest distance of the repaired surface from the original [m]
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the middle in the file's frame [m]
     parts: SurfaceParts | None = None
+    matter: Mapping[str, float] = field(default_factory=dict)  # see `Soup`
 
     def with_faces(self, vertices: Floats, faces: Indices, repair: str) -> RepairedMesh:
         return replace(self, vertices=vertices, faces=faces, repairs=(*self.repairs, repair))
@@ -75,7 +77,7 @@ def repair(soup: Soup, options: ObjectOptions) -> RepairedMesh:
         if found.resolution * unit <= max(COARSE_M, 1e-3 * unit * float(np.ptp(found.points, axis=0).max())):
             raise
         raise MeshError(f"{error}; {_resolution_note(found, unit)}", facts=error.facts) from None
-    mesh = replace(mesh, parts=parts_of(soup, given.vertices, given.faces))
+    mesh = replace(mesh, parts=parts_of(soup, given.vertices, given.faces), matter=soup.matter)
     if not mesh.repairs:
         return mesh
     moved = MeshDistance(given.vertices, given.faces).largest(surface_points(mesh.vertices, mesh.faces, _SAMPLES))

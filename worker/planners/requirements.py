@@ -107,6 +107,11 @@ class Requirements:
         return self.rule is not None and self.rule.kind == GraspType.PRECISION
 
     @property
+    def in_row(self) -> bool:
+        """Whether fingertips must touch in line, so that all pads start near the object."""
+        return self.by_pads and self.rule is not None and self.rule.arrangement == "line"
+
+    @property
     def links(self) -> int:
         """Least number of bodies in contact."""
         return max(2, self.rule.digits if self.rule else 0)

@@ -37,7 +37,7 @@ def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> 
         raise InputError(f"{folder} cannot be created: {error.strerror}; give another folder as --output") from None
     if any(folder.glob("view_*.json")):
         raise InputError(f"{folder} contains exported views already; give another folder as --output")
-    written = [_write_json(folder / "labels.json", _labels(views))]
+    written = [write_json(folder / "labels.json", _labels(views))]
     for view in range(len(views["camera/eye"])):
         written += _export_view(views, view, folder, depth)
     return written
@@ -50,7 +50,7 @@ def _export_view(views: Shard, view: int, folder: Path, depth: DepthFormat) -> l
     written = [
         export_png(path("rgb", "png"), views["image/rgb"][view]),
         export_png(path("semantic_segmentation", "png"), views["image/segmentation"][view]),
-        _write_json(path("view", "json"), describe(views, view)),
+        write_json(path("view", "json"), describe(views, view)),
     ]
     for dataset, name in _DISTANCES.items():
         if dataset in views.arrays:
@@ -115,6 +115,7 @@ def export_exr(path: Path, names: str, planes: Sequence[NDArray[Any]] | NDArray[
     return path
 
 
-def _write_json(path: Path, value: dict[str, Any]) -> Path:
+def write_json(path: Path, value: Any) -> Path:
+    """Write a JSON file; nan and infinity are refused."""
     path.write_text(json.dumps(value, allow_nan=False) + "\n")
     return path

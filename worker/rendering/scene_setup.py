@@ -37,6 +37,12 @@ _tracers: LRUCache[tuple[object, ...], Tracer] = LRUCache(4)
 _WOODS: Final = [("#b98a5a", "#8a5c34"), ("#d9b98c", "#b98f5e"), ("#7b5233", "#523320"), ("#a9978a", "#85736a")]
 _STONES: Final = [("#c9c6c0", "#8f8b85"), ("#6f7478", "#45494d"), ("#d8d3c8", "#b5ad9f"), ("#86908a", "#5d6761")]
 _CLOTHS: Final = ["#cfd3d6", "#e4ded2", "#9fb0b8", "#6d7f86", "#b7bda5", "#494f57", "#c9a98b"]
+#: Pairs of colours, pattern, and range of the roughness of tables of wood, stone and tiles.
+_TABLES: Final = (
+    (_WOODS, GRAIN, (0.45, 0.8)),
+    (_STONES, SPECKLE, (0.5, 0.8)),
+    ([(base, "#8b8883") for base in _CLOTHS], TILES, (0.45, 0.7)),
+)
 
 
 @dataclass(frozen=True)
@@ -203,22 +209,12 @@ def draw_table_look(rng: Generator) -> Appearance:
     """Draw wood, stone, tiles or a plain cloth."""
     kind = int(rng.integers(4))
     scale = float(rng.uniform(0.7, 1.5))
-    if kind == 0:
-        base, second = _WOODS[rng.integers(len(_WOODS))]
-        return Appearance(
-            linear_rgb_from_hex(base), linear_rgb_from_hex(second), GRAIN, scale, float(rng.uniform(0.45, 0.8))
-        )
-    if kind == 1:
-        base, second = _STONES[rng.integers(len(_STONES))]
-        return Appearance(
-            linear_rgb_from_hex(base), linear_rgb_from_hex(second), SPECKLE, scale, float(rng.uniform(0.5, 0.8))
-        )
-    base = _CLOTHS[rng.integers(len(_CLOTHS))]
-    if kind == 2:
-        return Appearance(
-            linear_rgb_from_hex(base), linear_rgb_from_hex("#8b8883"), TILES, scale, float(rng.uniform(0.45, 0.7))
-        )
-    return Appearance(linear_rgb_from_hex(base), pattern=PLAIN, roughness=float(rng.uniform(0.7, 0.95)))
+    if kind == 3:
+        base = _CLOTHS[rng.integers(len(_CLOTHS))]
+        return Appearance(linear_rgb_from_hex(base), pattern=PLAIN, roughness=float(rng.uniform(0.7, 0.95)))
+    pairs, pattern, roughness = _TABLES[kind]
+    main, second = map(linear_rgb_from_hex, pairs[rng.integers(len(pairs))])
+    return Appearance(main, second, pattern, scale, float(rng.uniform(*roughness)))
 
 
 def draw_object_look(rng: Generator) -> Appearance:

@@ -18,6 +18,9 @@ from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement
 
 CAPACITY: Final = 1024  # largest number of residuals per grasp and iteration
+#: The same on a GPU, where the order of residuals differs between runs: all must fit, or a random part would be used. A
+#: standard grasp has at most 1,934 (3 hands on a mug).
+CUDA_CAPACITY: Final = 4096
 CUDA_LANE: Final = 16  # residuals that one GPU thread adds to the equations
 BETTER_M: Final = 1e-5  # least reduction of penetration by which a state is better than another one [m]
 
@@ -42,10 +45,10 @@ class ProjectionOptions:
     step: float = 3e-3  # largest step in units of the scaled variables [m]
 
 
-def _allocate_residuals(capacity: int) -> Any:
+def _allocate_residuals(capacity: int, each: int) -> Any:
     out = kernels.Residuals()
     out.count = wp.zeros(capacity, dtype=wp.int32)
-    shape = (capacity, CAPACITY)
+    shape = (capacity, each)
     out.body, out.other = (wp.empty(shape, dtype=wp.int32) for _ in range(2))
     out.point, out.direction = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
     out.value, out.weight = (wp.empty(shape, dtype=wp.float32) for _ in range(2))
@@ -58,12 +61,13 @@ class Projection:
     def __init__(self, model: Model, data: Data, options: ProjectionOptions) -> None:
         self.model, self.data, self.options = model, data, options
         hand, B, n = model.hand.model, data.capacity, 6 + model.dofs
-        self._lane = CUDA_LANE if wp.get_device(model.device).is_cuda else CAPACITY
-        self._lanes = -(-CAPACITY // self._lane)
+        is_cuda = wp.get_device(model.device).is_cuda
+        each, self._lane = (CUDA_CAPACITY, CUDA_LANE) if is_cuda else (CAPACITY, CAPACITY)
+        self._lanes = each // self._lane
         scale = np.repeat(options.scale, [3, 3, model.dofs])
         scale[6:] *= data.unit
         with wp.ScopedDevice(model.device):
-            self.residuals = _allocate_residuals(B)
+            self.residuals = _allocate_residuals(B, each)
             self._row = wp.empty((B * self._lanes, n), dtype=wp.float32)
             self.matrix, self.vector = wp.zeros((B, n, n), dtype=wp.int64), wp.zeros((B, n), dtype=wp.int64)
             self._factor, self._move = wp.empty((B, n, n), dtype=wp.float64), wp.empty((B, n), dtype=wp.float64)

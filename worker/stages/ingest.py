@@ -142,10 +142,11 @@ def _refusal_record(kind: AssetKind, name: str, why: str) -> dict[str, Any]:
 def _check_upload(kind: str, name: str, source: str, target: str, memory_bytes: str, cpu_s: str) -> None:
     # The hard limit stays, since its signal equals that of a machine out of memory. Children have their own limits.
     resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s), resource.getrlimit(resource.RLIMIT_CPU)[1]))
-    limits = {resource.RLIMIT_AS: int(memory_bytes), resource.RLIMIT_CORE: 0, resource.RLIMIT_FSIZE: _MODEL_BYTES}
-    for limit, value in limits.items():
-        resource.setrlimit(limit, (value, value))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_AS, (int(memory_bytes),) * 2)
     files = unpack(Path(source).read_bytes(), limit_bytes=UNPACKED_LIMIT_BYTES)
+    # The reader of USD needs the layers as files.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (max(_MODEL_BYTES, *map(len, files.values())),) * 2)
     if AssetKind(kind) is AssetKind.HAND:
         from graspd.worker.hands.check import check_hand
 

@@ -465,8 +465,8 @@ class DatasetChanges(IndexPart):
         with self.database.write_transaction(within) as connection:
             upsert(connection, object_sets, [row])
 
-    def set_progress(self, name: str, **values: int) -> None:
-        with self.database.write_transaction() as connection:
+    def set_progress(self, name: str, *, within: Connection | None = None, **values: int) -> None:
+        with self.database.write_transaction(within) as connection:
             connection.execute(update(datasets).where(datasets.c.name == name).values(**values))
 
 

@@ -97,8 +97,8 @@ class Feed(IndexPart):
         query = select(tasks.c.id, tasks.c.last_attempt).where(tasks.c.job_id == job_id, final)
         return {row["id"]: row["last_attempt"] for row in self.database.rows(query)}
 
-    def unfinished_tasks(self, job_id: str) -> list[str]:
-        """Return tasks of a job that are in the queue or running."""
+    def queued_tasks(self, job_id: str) -> list[str]:
+        """Return the tasks of a job that are marked as queued; running ones are, too."""
         return self.database.column(select(tasks.c.id).where(tasks.c.job_id == job_id, tasks.c.queued.is_(True)))
 
 

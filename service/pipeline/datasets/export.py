@@ -9,7 +9,7 @@ from typing import Final
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.records import Snapshot, SnapshotShard
-from graspd.service.store.integrity import check_digest
+from graspd.service.store.integrity import CHECKSUMS, check_digest
 
 #: Function that yields the bytes of a shard in chunks, from the API or from the store.
 Fetch = Callable[[SnapshotShard], Iterable[bytes]]
@@ -19,7 +19,7 @@ _CHUNK: Final = 1 << 20
 
 
 def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Progress | None = None) -> int:
-    """Export shards, then `SHA256SUMS` and `snapshot.json`; return the number of fetched shards.
+    """Export shards, then `checksums.sha256` and `snapshot.json`; return the number of fetched shards.
 
     Files are `HAND/OBJECT/KIND-BATCH.h5`. DamagedShard: a checksum differs from that in the snapshot.
     """
@@ -34,7 +34,7 @@ def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Prog
         if progress is not None:
             progress(number, len(snapshot.shards), size)
     sums = "".join(f"{shard.sha256}  {path_of(shard)}\n" for shard in snapshot.shards)
-    (folder / "SHA256SUMS").write_text(sums)
+    (folder / CHECKSUMS).write_text(sums)
     (folder / "snapshot.json").write_text(snapshot.model_dump_json(indent=1) + "\n")
     return fetched
 

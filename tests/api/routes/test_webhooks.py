@@ -99,6 +99,10 @@ def test_a_dataset_that_ended_is_told_once(http: TestClient, services: Services,
     plan_all(services)
     ear.round()
     ear.round()
+    http.delete("/v1/datasets/d")
+    assert http.post("/v1/datasets/d/restore").status_code == 200
+    plan_all(services)
+    ear.round()
     told = [one for one in http.get("/v1/events").json()["items"] if one["kind"] == "dataset"]
     assert [(one["subject"], one["state"]) for one in told] == [("d", "cancelled")]
 

@@ -145,7 +145,7 @@ DESCRIBED = ["a/clean.stl", "a/asset.json", "b/clean.stl"]
         (EGAD, {"A0": ["A0.obj"], "B3": ["B3.obj"]}),
         (YCB, {"a": ["nontextured.stl"], "b": ["textured.obj"]}),
         (DESCRIBED, {"a": ["asset.json", "clean.stl"], "b": ["clean.stl"]}),
-        (["x/my mug!.stl", "x/my_mug_.stl"], {"my_mug_": ["my mug!.stl"], "my_mug_-2": ["my_mug_.stl"]}),
+        (["a b.stl", "a!b.stl", "a?b.stl"], {"a_b": ["a b.stl"], "a_b-2": ["a!b.stl"], "a_b-3": ["a?b.stl"]}),
     ],
 )
 def test_a_folder_of_meshes_is_a_set_of_objects(paths: list[str], objects: dict[str, list[str]]) -> None:

@@ -20,7 +20,7 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.grasp_types import BALANCED
-from graspd.service.model.transforms import quat_rotate
+from graspd.service.model.transforms import apply, quat_rotate
 from graspd.service.readers import Grasps, open_shards
 from graspd.service.readers.where import compile_expression
 from graspd.service.store.manifests import _grasp_summaries
@@ -34,11 +34,14 @@ from graspd.worker.files.synthesis import synthesize_grasps
 from graspd.worker.generation import validated_grasps
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.digits import hand_with_digits
+from graspd.worker.hands.jaws import fingertip_pad
+from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.planners import PlanRequest, synthesize
 from graspd.worker.planners.fast_graspd import starts
 from graspd.worker.planners.fast_graspd.antipodal_starts import ReachSampling, crossings_of
+from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.pairs import pair_of
 from graspd.worker.planners.fast_graspd.scene_starts import EVERY, REACHING, clear_scene_starts, free_directions
 from graspd.worker.planners.fast_graspd.starts import RETREATS, clear_starts, start_generator
@@ -46,6 +49,7 @@ from graspd.worker.planners.requirements import INNER, LEAST_SHARE, NOTHING, Req
 from graspd.worker.quality.contact import LINK_CONTACT_M
 from graspd.worker.quality.probe import probe_of
 from graspd.worker.quality.table import measure
+from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.kernels import reaching
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from tests.worker.commands_run import graspd as graspd_command
@@ -112,6 +116,38 @@ def test_draws_of_the_kernel_approach_within_the_cone() -> None:
         state, number = sampling.starts(np.arange(300, dtype=np.int32), np.zeros(300, np.int32), np.array(RETREATS))
         drawn.append((approaches(state.rotation) @ AXIS)[number >= 0])
     assert len(drawn[0]) > 30 and drawn[0].min() >= np.cos(INNER * wanted.cone) - 1e-5 and drawn[1].min() < 0.0
+
+
+def draws(wanted: Requirements, obj=BAR, count: int = 200) -> tuple[ReachSampling, HandState]:
+    pair = pair_of(hand := wanted.hand(HAND), obj.centred, DRAFT, "cpu")
+    sampling = ReachSampling.of(pair.model(pair.coarse), wanted)
+    state, number = sampling.starts(np.arange(count, dtype=np.int32), np.zeros(count, np.int32), np.array(RETREATS))
+    assert hand.dofs == state.q.shape[1] and (number >= 0).mean() > 0.5
+    return sampling, state[np.flatnonzero(number >= 0)]
+
+
+def test_fingers_in_line_start_with_all_pads_near_the_object() -> None:
+    slab, far = object_from_mesh(trimesh.creation.box((0.04, 0.16, 0.16))), {}
+    for kind in ("prismatic_3_finger", "quadpod"):
+        grasp = posture_of(HAND, slab.centred, draws(required(slab, type=kind), slab)[1])
+        tips = body_poses(HAND, grasp.hand_pose, grasp.joint_positions)[:, list(HAND.fingertips)]
+        pads = apply(tips, np.array([fingertip_pad(HAND, tip).centre for tip in HAND.fingertips]))
+        far[kind] = np.linalg.norm(np.maximum(np.abs(pads) - (0.02, 0.08, 0.08), 0), axis=-1).max(axis=1)
+    # A pad is at most 24 mm away (half the clearance is at most 18 mm), before noise of a few millimetres.
+    assert np.median(far["prismatic_3_finger"]) < 0.03 < np.quantile(far["quadpod"], 0.2)
+
+
+def test_all_hands_start_around_a_thin_region() -> None:
+    # A rod with a knob on a block: the knob is as wide as the gap of a pinch, so the region is not small everywhere.
+    sizes, places = ((0.06, 0.06, 0.06), (0.03, 0.01, 0.012), (0.004, 0.03, 0.012)), (0.0, 0.045, 0.062)
+    parts = [trimesh.creation.box(size).apply_translation((x, 0, 0)) for size, x in zip(sizes, places, strict=True)]
+    obj = object_from_mesh(trimesh.util.concatenate(parts))
+    assert crossings_of(obj.centred, required(obj, touch_region="x > 0.032").region).width.max() > 0.025
+    thin, state = draws(required(obj, touch_region="x > 0.032"), obj)
+    assert thin.only and not draws(NOTHING, obj)[0].only and not draws(required(touch_region="z > 0.09"))[0].only
+    # Palms that start towards a point of the rod are nearer than 30 mm to its middle.
+    away = np.linalg.norm(state.pivot + obj.centre_of_mass - [0.045, 0, 0], axis=1)
+    assert away.min() > 0.03 and np.median(away) > 0.06
 
 
 @pytest.mark.parametrize("place", ["free", "table"])

@@ -9,11 +9,13 @@ import pytest
 import trimesh
 import warp as wp
 
+from benchmarks.integrators import reference
+from benchmarks.integrators.gradients import SOLVERS, reference_gradient, run_kernel
+from benchmarks.integrators.reference import Contacts, World
 from graspd.service.model.contact_region import parse_region
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.transforms import quat_from_axis_angle, quat_multiply
-from graspd.studies.stability.gradients import SOLVERS, reference_gradient, run_kernel
 from graspd.worker.control.postures import pregrasp
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import Posture
@@ -24,7 +26,7 @@ from graspd.worker.objects.region import ContactRegion
 from graspd.worker.planners import PlanRequest
 from graspd.worker.planners.fast_graspd import planner
 from graspd.worker.planners.fast_graspd.candidates import posture_of
-from graspd.worker.simulation import launches, reference
+from graspd.worker.simulation import launches
 from graspd.worker.simulation.data import Data, HandState, allocate_contacts, zero_schedule
 from graspd.worker.simulation.device import DeviceHand, DeviceObject
 from graspd.worker.simulation.kernels import packing, wrenches
@@ -42,7 +44,6 @@ from graspd.worker.simulation.model import (
 )
 from graspd.worker.simulation.projection import Projection, ProjectionOptions
 from graspd.worker.simulation.record import record_evaluation
-from graspd.worker.simulation.reference import Contacts, World
 from graspd.worker.simulation.sampling import object_samples
 from tests.worker.models import object_from_mesh, two_finger_hand, unit_vectors
 from tests.worker.simulation.rigs import rig, still

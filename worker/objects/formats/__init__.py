@@ -1,4 +1,4 @@
-"""Mesh files from bytes: STL, OBJ, PLY, OFF, GLB, DAE. The input may be hostile: no header is trusted."""
+"""Mesh files from bytes: STL, OBJ, PLY, OFF, GLB, DAE, USD. The input may be hostile: no header is trusted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from graspd.service.model.errors import GraspdError, MeshError
 from graspd.worker.objects.format_check import check_format, format_hint
-from graspd.worker.objects.formats import bare, dae, glb, obj
+from graspd.worker.objects.formats import bare, dae, glb, obj, usd
 from graspd.worker.objects.formats.obj import Nearby, no_files
 from graspd.worker.objects.formats.soup import MAX_FACES, Soup, check_soup
 
@@ -26,6 +26,7 @@ READERS: Final[dict[str, Callable[..., Soup]]] = {
     ".off": bare.read_off,
     ".glb": glb.read,
     ".dae": dae.read,
+    **dict.fromkeys(usd.SUFFIXES, usd.read),
 }
 #: Python's quotation of text that it cannot parse as a number.
 _NO_NUMBER: Final = re.compile(r": (?:np\.bytes_\()?b?'(.{1,40}?)'")
@@ -45,7 +46,8 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = no_files) -> Soup:
     if not data:
         raise MeshError(f"{filename}: the file is empty; export the mesh again")
     text = _strip_byte_order_mark(data)
-    check_format(filename, text, MeshError)
+    if suffix not in usd.SUFFIXES or not text.startswith(usd.MAGIC):
+        check_format(filename, text, MeshError)
     try:
         # The check below finds invalid numbers, so NumPy's warnings are not needed.
         with np.errstate(all="ignore"):

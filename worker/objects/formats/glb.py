@@ -200,11 +200,11 @@ def material_colour(document: dict[str, Any], binary: bytes, primitive: dict[str
         material = document["materials"][int(primitive["material"])]["pbrMetallicRoughness"]
         factor = np.array(material.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0)), float)[:3].reshape(3)
         if "baseColorTexture" in material:
-            colour = _from_linear(
+            colour = from_linear(
                 _to_linear(_mean_texture_colour(document, binary, material["baseColorTexture"])) * factor
             )
         elif "baseColorFactor" in material:
-            colour = _from_linear(factor)
+            colour = from_linear(factor)
         else:
             return _UNKNOWN
     except (LookupError, TypeError, AttributeError, *UNREADABLE):
@@ -227,5 +227,5 @@ def _to_linear(colour: Floats) -> Floats:
     return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
 
 
-def _from_linear(colour: Floats) -> Floats:
+def from_linear(colour: Floats) -> Floats:
     return np.where(colour <= 0.0031308, 12.92 * colour, 1.055 * np.maximum(colour, 0.0031308) ** (1 / 2.4) - 0.055)

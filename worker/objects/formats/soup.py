@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Final, TypeVar
 
 import manifold3d
@@ -31,6 +31,8 @@ class Soup:
     paint: NDArray[np.float64] | None = None
     """(F, 3) colours that select faces but are not drawn; None: those of `colours`."""
     names: FaceNames | None = None
+    matter: Mapping[str, float] = field(default_factory=dict)
+    """What the file states of `mass` [kg], `density` [kg/m^3] and `friction`."""
 
     def by_colour(self) -> list[tuple[tuple[float, float, float] | None, NDArray[np.intp]]]:
         """Return each colour with the indices of its faces; faces without a colour are under None."""

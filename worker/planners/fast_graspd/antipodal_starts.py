@@ -32,7 +32,7 @@ from graspd.service.model.transforms import (
 )
 from graspd.worker.hands.flat_pinches import HEIGHTS_M, flat_pinches
 from graspd.worker.hands.grasp_widths import Size, largest_width, postures_between, postures_for_size
-from graspd.worker.hands.jaws import least_fingertip_width
+from graspd.worker.hands.jaws import fingertip_pad, least_fingertip_width
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import PinchPostures, pinch_postures_of
@@ -385,6 +385,8 @@ BALLS: Final = 96
 BALL_M: Final = 0.005
 #: An object is small if all its pairs are narrower than this [m] and than the smallest gap of the hand's pads.
 SMALL_M: Final = 0.017
+#: Largest distance of a pad from the object, in addition to half the clearance, where fingers are in line [m].
+ROW_M: Final = 0.006
 #: Error of the grid's distances [m].
 SLACK_M: Final = 0.001
 
@@ -394,7 +396,7 @@ class ReachSampling:
     model: Model
     grips: Any
     only: bool
-    """Whether all starts are antipodal, because the object is too small or too wide for the pads.
+    """Whether all starts are antipodal, because the object is too small or too wide for the pads, or its region thin.
     Starts with the palm towards a random point then rarely succeed."""
 
     @classmethod
@@ -442,6 +444,8 @@ def _grips(hand: HandModel, obj: ObjectModel, device: str, wanted: Requirements)
     """Return `ReachSampling.grips` and `.only`; None if no posture fits a pair."""
     pairs, out = crossings_of(obj, wanted.region), kernels.Grips()
     size = classify_size(hand, pairs.width)
+    if size is None and wanted.region.touch is not None and len(pairs) and np.median(pairs.width) < SMALL_M:
+        size = "small"  # a thin part, such as a handle: a palm towards it would meet the rest of the object
     if (parts := wanted.opposed_parts(hand)) is not None:
         known, size = postures_between(hand, *parts), "small"
     else:
@@ -465,6 +469,9 @@ def _grips(hand: HandModel, obj: ObjectModel, device: str, wanted: Requirements)
         out.opened = wp.array(known.width, dtype=wp.float32)
         out.balls = wp.array(balls, dtype=wp.vec3)
         out.radius = BALL_M - SLACK_M
+        pads = _pads(hand, known) if wanted.in_row else np.zeros((len(known), 0, 3))
+        out.pads = wp.array(pads, dtype=wp.vec3, ndim=2)
+        out.beyond = ROW_M
         # Objects that are too small or too wide are held between the pads, never nearer to the palm.
         at_pads = bool(size) or wanted.by_pads
         out.deep = 0.0 if at_pads else 1.0
@@ -474,3 +481,10 @@ def _grips(hand: HandModel, obj: ObjectModel, device: str, wanted: Requirements)
         out.noise = wp.array(NOISE * hand.span, dtype=wp.float32)
         out.lower, out.upper = wp.array(hand.lower, dtype=wp.float32), wp.array(hand.upper, dtype=wp.float32)
     return out, at_pads
+
+
+def _pads(hand: HandModel, known: PinchPostures) -> Floats:
+    """Return the centres of the fingertips' pads (K, F, 3) in each posture, relative to the palm's centre [m]."""
+    tips = list(hand.fingertips)
+    pose = body_poses(hand, np.tile(IDENTITY_POSE, (len(known), 1)), hand.expand(known.q))[:, tips]
+    return np.asarray(apply(pose, np.array([fingertip_pad(hand, tip).centre for tip in tips])) - hand.palm.centre)

@@ -26,6 +26,8 @@ class Grips:
     opened: wp.array(dtype=wp.float32)  # (K,) width between the pads, ascending
     balls: wp.array2d(dtype=wp.vec3)  # (K, S) centres of balls in the hand
     radius: wp.float32
+    pads: wp.array2d(dtype=wp.vec3)  # (K, F) pads that should be near the object; F is 0 unless fingers are in line
+    beyond: wp.float32  # largest distance of these pads, in addition to half the clearance
     deep: wp.float32  # largest shift of the pair from the pads to the palm, as a share of their distance
     palm: wp.vec3  # unit, direction that the palm faces
     cone_axis: wp.vec3  # cone of the palm's approach
@@ -40,6 +42,7 @@ class HandSample:
     """A drawn hand."""
 
     found: wp.bool
+    near: wp.bool  # whether all pads are near the object
     posture: wp.int32
     pivot: wp.vec3
     rotation: wp.quat
@@ -65,6 +68,16 @@ def is_clear(surface: Surface, grips: Grips, posture: wp.int32, pivot: wp.vec3, 
     for s in range(grips.balls.shape[1]):
         place = pivot + wp.quat_rotate(rotation, grips.balls[posture, s])
         if cube_distance(cube_around(surface, place)) < grips.radius:
+            return False
+    return True
+
+
+@wp.func
+def pads_near(surface: Surface, grips: Grips, hand: HandSample, gap: wp.float32):
+    """Check that no pad is farther from the surface than `gap`, its expected distance, and `beyond`."""
+    for f in range(grips.pads.shape[1]):
+        place = hand.pivot + wp.quat_rotate(hand.rotation, grips.pads[hand.posture, f])
+        if cube_distance(cube_around(surface, place)) > gap + grips.beyond:
             return False
     return True
 
@@ -125,6 +138,7 @@ def draw_hand(
         out.pivot = pivot + retreats[r] * away
         if is_clear(surface, grips, out.posture, out.pivot, out.rotation):
             out.found = True
+            out.near = pads_near(surface, grips, out, 0.5 * (grips.opened[out.posture] - grips.width[pair]))
             return out
     return out
 
@@ -145,13 +159,13 @@ def reach(
     q_out: wp.array2d(dtype=wp.float32),
 ):
     """Find each start's first clear draw with a number from `first` to below `draws`; -1 if none is clear.
-    Launch over B."""
+    Draws with all pads near the object come first. Launch over B."""
     b = wp.tid()
     number_out[b] = -1
     for k in range(first_in[b], draws_in):
         state = wp.rand_init(seed_in[b], k)
         found = draw_hand(surface_in, grips_in, alike_in, room_in, retreat_in, state)
-        if found.found:
+        if found.found and (found.near or number_out[b] < 0):
             number_out[b] = k
             pivot_out[b] = found.pivot
             rotation_out[b] = found.rotation
@@ -160,4 +174,5 @@ def reach(
             for d in range(q_out.shape[1]):
                 q = grips_in.posture[found.posture, d] + grips_in.noise[d] * wp.randn(noise)
                 q_out[b, d] = wp.clamp(q, grips_in.lower[d], grips_in.upper[d])
-            return
+            if found.near:
+                return

@@ -269,7 +269,7 @@ def source(services: Services) -> Fetch:
 
 def test_every_file_is_there_with_its_checksum(source: Fetch, snapshot: Snapshot, tmp_path: Path) -> None:
     assert export_shards(snapshot, tmp_path / "out", source) == 8
-    check = subprocess.run(["sha256sum", "-c", "--quiet", "SHA256SUMS"], cwd=tmp_path / "out", check=False)
+    check = subprocess.run(["sha256sum", "-c", "--quiet", "checksums.sha256"], cwd=tmp_path / "out", check=False)
     assert check.returncode == 0
     assert Snapshot.model_validate_json((tmp_path / "out" / "snapshot.json").read_text()) == snapshot
     with h5py.File(tmp_path / "out" / "claw" / "cube" / "base-00000.h5") as file:

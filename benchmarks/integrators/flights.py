@@ -1,7 +1,7 @@
 """Integrators alone: a ball thrown into a cage of contact points, step by step, in float64.
 
 A good integrator adds no energy, keeps the ball in the fixed cage and prevents penetration. Position-based integrators
-are those of `worker.simulation.reference`. The force-based one is Grasp'D's penalty force under semi-implicit Euler."""
+are those of `reference.py`. The force-based one is Grasp'D's penalty force under semi-implicit Euler."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Final
 
 import numpy as np
 
+from benchmarks.integrators import reference
+from benchmarks.integrators.reference import Contacts, World
 from graspd.service.model.studies import MapCell, StabilityMap, format_short, grade, mark_reachable
 from graspd.service.model.transforms import Floats
-from graspd.worker.simulation import reference
 from graspd.worker.simulation.model import LossOptions
-from graspd.worker.simulation.reference import Contacts, World
 
 #: Function from contacts (with present distances), free motion and world to the permitted motion.
 Solver = Callable[[Contacts, Floats, World], Floats]

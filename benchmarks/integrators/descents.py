@@ -33,8 +33,7 @@ RATES: Final = (0.01, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
 WEIGHTS: Final = (0.0, 0.01, 0.1, 1.0, 10.0, 100.0)
 #: Names of the panels. Plain descent uses the rates tuned for Adam, unlike `optimizer: gd`.
 _OPTIMIZERS: Final = {"adam": "Adam", "gd": "plain descent, Adam's rates"}
-LENGTHS: Final = (100, 1_000, 10_000)
-LONG: Final = 100_000
+LENGTHS: Final = (100, 1_000, 10_000, 100_000)
 DEPTH_MM: Final = (0.5, 2.0)  # median penetration that counts as weak and as broken [mm]
 #: Residual of the contact force balance that counts as weak and as broken; 1: no balance.
 RESIDUAL: Final = (0.35, 0.9)

@@ -11,13 +11,13 @@ from typing import Any, Final
 import numpy as np
 import warp as wp
 
+from benchmarks.integrators import reference
+from benchmarks.integrators.flights import Solver, gauss_seidel_sweep
+from benchmarks.integrators.reference import Contacts, World
 from graspd.service.model.studies import MapCell, StabilityMap, grade, mark_reachable
 from graspd.service.model.transforms import Floats
-from graspd.studies.stability.integrators import Solver, gauss_seidel_sweep
-from graspd.worker.simulation import reference
 from graspd.worker.simulation.kernels import contact, kinematics, packing
 from graspd.worker.simulation.model import initial_motions
-from graspd.worker.simulation.reference import Contacts, World
 
 PASSES: Final = 12
 #: Radii of the held ball [m]; scale of its contacts' depths and gaps, as a multiple of the step.

@@ -1,0 +1,1 @@
+"""Failures of integrators, gradients and descents (docs/results/stability/stability.md)."""

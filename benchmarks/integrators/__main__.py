@@ -1,0 +1,76 @@
+"""Map where integrators, gradients and the planner's descent fail, for an Allegro hand and a block.
+
+usage: python -m benchmarks.integrators --out DIR [--only MAP ...] [--quick]
+DIR receives stability.json, stability.md and the maps; `graspd stability --from` merges and publishes them. The quick
+run takes a minute of CPU time, the full run hours, because its longest descent has 100,000 iterations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from benchmarks.integrators import descents, flights, gradients
+from graspd.service.model.clock import timestamp
+from graspd.service.model.studies import Stability, StabilityMap
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.studies.stability.report import write
+from graspd.worker.engines import backend
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.objects.prepare import object_from_path
+
+MAPS = ("time_step", "stiffness", "contact_count", "gradient", "starts", "rates", "length")
+
+
+def measure(names: Sequence[str], *, quick: bool, say: Callable[[str], object]) -> list[StabilityMap]:
+    """Return the named maps; `say` receives a line per map and per cell of a descent."""
+    hand, thing = hand_from_path("allegro"), object_from_path("block")
+    count = 4 if quick else 8
+
+    def few(values: Sequence[float]) -> Sequence[float]:
+        return values[1::2] if quick else values
+
+    lengths = descents.LENGTHS[:1] if quick else descents.LENGTHS
+    maps: dict[str, Callable[[], StabilityMap]] = {
+        "time_step": lambda: flights.time_step_map(few(flights.TIME_STEPS), few(flights.SPEEDS)),
+        "stiffness": lambda: flights.stiffness_map(
+            few(flights.STIFFNESSES), few(flights.MASSES), few(flights.TIME_STEPS)
+        ),
+        "contact_count": lambda: flights.contact_count_map(flights.COUNTS[:: 2 if quick else 1]),
+        "gradient": lambda: gradients.gradient_map(
+            few(gradients.SIZES_M), few(gradients.GAPS), repeats=1 if quick else 3
+        ),
+        "starts": lambda: descents.start_map(hand, thing, count=count, say=say),
+        "rates": lambda: descents.rate_map(
+            hand, thing, rates=few(descents.RATES), weights=few(descents.WEIGHTS), count=count, say=say
+        ),
+        "length": lambda: descents.length_map(hand, thing, lengths=lengths, say=say),
+    }
+    found = []
+    for name in names:
+        say(f"map {name}")
+        found.append(maps[name]())
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder for the maps")
+    parser.add_argument("--only", nargs="+", choices=MAPS, default=MAPS)
+    parser.add_argument("--quick", action="store_true", help="few cells per map")
+    args = parser.parse_args(arguments)
+    backend.start_warp()
+    import warp as wp
+
+    maps = measure(args.only, quick=args.quick, say=lambda line: sys.stderr.write(f"{line}\n"))
+    words = ["python -m benchmarks.integrators", *(["--quick"] if args.quick else [])]
+    if args.only != MAPS:
+        words += ["--only", *args.only]
+    versions = {"graspd": PACKAGE_VERSION, "warp": wp.__version__}
+    write(Stability(timestamp(), " ".join(words), versions, maps), args.out)
+
+
+if __name__ == "__main__":
+    main()
