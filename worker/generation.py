@@ -376,6 +376,12 @@ class Batch:
         self.seconds: dict[str, float] = {"planner": 0.0, "validation": 0.0, "quality": 0.0}
         every = range(0 if scoring.scenes is None else len(scoring.scenes.object_pose))
         self._scenes = every if scenes is None else scenes
+        room = np.ones(len(self._scenes), bool)
+        if scoring.scenes is not None:
+            room = self.requirements.has_room(scoring.hand, scoring.scenes.placed(np.zeros(0, int)))
+            room = room[self._scenes.start : self._scenes.stop]
+        self._used = np.flatnonzero(room if room.any() else ~room)
+        """Scenes that grasps use in turn, relative to the batch's first: those with room for a demonstrated pose."""
         self._rechecks: Future[NDArray[np.int8]] | None = None
         self._kept = np.zeros((0, POINTS, 3))
         self._needs = self._round_requests()
@@ -484,7 +490,7 @@ class Batch:
             poses, own = scenes, slice(self._scenes.start, self._scenes.stop)
             beside = poses.neighbour_pose[own] if poses.neighbours else poses.neighbour_pose
             mine = replace(poses, object_pose=poses.object_pose[own], neighbour_pose=beside)
-            placed = mine.placed((asked.begun + np.array(rows)) % len(self._scenes))
+            placed = mine.placed(self._used[(asked.begun + np.array(rows)) % len(self._used)])
         knobs, seed = self.request.resolved_fidelity, self.request.seed
         wanted = self.requirements
         return PlanRequest(len(rows), knobs, seed, number, placed, rollout, rows.start, wanted, others_have_place)

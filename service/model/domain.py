@@ -181,7 +181,11 @@ class JobOptions(Model):
         description="cone of the palm's approach: axis and largest angle [deg], such as 0, 0, -1, 30. The axis is in "
         "the frame of the scene, or of a free object",
     )
-    like: Annotated[WristPose, Option(schema=7)] = _sparse_field(
+    like: Annotated[
+        WristPose,
+        Option(schema=7),
+        FormField("grasps", "Wrist pose", "x, y, z, qw, qx, qy, qz", placeholder="0, 0, 0.1, 1, 0, 0, 0", cells=True),
+    ] = _sparse_field(
         "",
         description="demonstrated wrist pose x, y, z, qw, qx, qy, qz in the object's frame [m]. Grasps start around it "
         "and stay within 4 cm and 30 degrees",

@@ -252,6 +252,25 @@ def scenes_of_shard(shard: Shard) -> PlacedGrasps | None:
     return scenes.placed(np.asarray(shard["grasp/scene_index"], np.intp))
 
 
+def check_wrist_poses(shard: Shard, hand: str, obj: str, options: Mapping[str, Any]) -> None:
+    """Check that wrist poses of a shard hold for a hand and an object with mesh options: the object by its digest.
+    Raises InputError: another object, or a hand of another name and digest."""
+    said, file = shard.attributes, shard.path
+    name, files, _ = object_files(Path(obj))
+    digest = digest_variant(digest_files(AssetKind.OBJECT, files), options)
+    if said.get("object_digest", digest) != digest:
+        raise InputError(
+            f"the grasps in {file} are of another object ({said['object']}) than {name}, or of other mesh options: a "
+            "wrist pose is in the object's frame"
+        )
+    name, files, _ = hand_files(Path(hand))
+    if said.get("hand", name) != name and said.get("hand_digest") != digest_files(AssetKind.HAND, files):
+        raise InputError(
+            f"the grasps in {file} are of {said['hand']}, and wrist frames of hands differ: use graspd transfer {file} "
+            f"--hand {name}"
+        )
+
+
 def _check_digest(shard: Shard, kind: str, digest: str, given: str) -> None:
     expected = str(shard.attributes.get(f"{kind}_digest", ""))
     if expected != digest:

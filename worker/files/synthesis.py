@@ -30,6 +30,7 @@ from graspd.worker.execution_context import ExecutionContext, PrefilterMode, Pro
 from graspd.worker.files.provenance import (
     NEIGHBOUR_FACE_ERROR_M,
     base_attributes,
+    check_wrist_poses,
     neighbour_attributes,
     path_attributes,
     wrist_attributes,
@@ -170,10 +171,11 @@ class SynthesisResult:
 
 def synthesize_with_options(hand: str, obj: str, options: LocalOptions, **run: Any) -> SynthesisResult:
     """Run `synthesize_grasps` with a local user's options; `run` are its further arguments."""
+    pose = wrist_pose(str(options.like), hand, obj, options.mesh_options)
     return synthesize_grasps(
         hand,
         obj,
-        options.job_options(local_options(options.method, options.options), wrist_pose(str(options.like))),
+        options.job_options(local_options(options.method, options.options), pose),
         place=options.scene_spec,
         scenes=options.scenes,
         mesh=options.mesh_options,
@@ -184,12 +186,13 @@ def synthesize_with_options(hand: str, obj: str, options: LocalOptions, **run: A
     )
 
 
-def wrist_pose(like: str) -> str:
+def wrist_pose(like: str, hand: str, obj: str, mesh: Mapping[str, Any]) -> str:
     """Return option `like` as seven numbers; a grasp file without a row stands for its first valid grasp.
-    Raises InputError: no such row, or no valid grasp."""
+    Raises InputError: no such row, no valid grasp, or see `check_wrist_poses`."""
     if (found := GRASP_FILE.fullmatch(like)) is None:
         return like
     shard = read_shard(Path(found[1]), kind="base")
+    check_wrist_poses(shard, hand, obj, mesh)
     rows = np.arange(len(shard["quality/valid"]))
     if found[2] is not None and int(found[2]) >= len(rows):
         raise InputError(f"{found[1]} has {len(rows)} grasps, numbered from 0: row {found[2]} does not exist")

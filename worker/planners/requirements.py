@@ -30,6 +30,7 @@ from graspd.worker.quality.grasp_type import RULES, Rule, pattern_of
 from graspd.worker.quality.probe import probe_of
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.simulation.model import ANYWHERE, AllowedContacts
+from graspd.worker.simulation.obstacles import MARGIN_M, body_clearance
 
 #: Share of the cone's angle within which hands start: the optimisation turns them.
 INNER: Final = 0.6
@@ -196,15 +197,24 @@ class Requirements:
             raise InputError("obstacles block every approach in the cone: choose another axis or a larger angle")
         return np.asarray(ways[inside])
 
+    def has_room(self, hand: HandModel, scenes: PlacedGrasps) -> NDArray[np.bool_]:
+        """Return a mask (S,) of scenes in which the palm is clear of obstacles at the demonstrated wrist pose."""
+        count = len(scenes.object_pose)
+        if self.like is None:
+            return np.ones(count, bool)
+        grasp = Posture(np.tile(self.like, (count, 1)), hand.expand(np.tile(hand.preshape, (count, 1))))
+        clearance = body_clearance(hand, grasp, scenes.scenes, np.arange(count))
+        return np.asarray((clearance[:, finger_of_body(hand) < 0] >= MARGIN_M).all(axis=1))
+
     def fulfilled(
-        self, hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps | None
+        self, hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps | None, device: str = "cpu"
     ) -> NDArray[np.bool_]:
         """Return a mask (N,) of grasps of the whole hand with the required type, approach and wrist pose."""
         out = self._is_like(grasp)
         if (axes := self.axes(placed, len(grasp))) is not None:
             out &= _cosine(hand, grasp, axes) >= np.cos(self.cone)
         if self.rule is not None:
-            probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
+            probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64, device=device)
             out &= self.rule.applies(pattern_of(hand, probe, probe.nearest_points(grasp, reach=_REACH_M)))
         return out
 

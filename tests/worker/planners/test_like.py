@@ -15,15 +15,18 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.options import validate
+from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.shards import read_shard, write_shard
 from graspd.worker.files.synthesis import SynthesisResult, synthesize_with_options, wrist_pose
-from graspd.worker.generation import validated_grasps
+from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.requirements import LIKE_DEG, LIKE_M, Requirements
+from graspd.worker.scenes.kinds import supports_of
+from graspd.worker.simulation.environment import Scenes
 from tests.worker.hands.urdfs import gripper
-from tests.worker.models import quality_columns
+from tests.worker.models import object_from_mesh, quality_columns
 
 COLUMNS = ("quality/like_distance_m", "quality/like_angle_deg")
 DRAFT = {"fidelity": "draft", "device": "cpu", "seed": 3}
@@ -88,11 +91,11 @@ def test_a_grasp_file_stands_for_a_row_by_default_the_first_valid_one(tmp_path: 
         (tmp_path / name).write_bytes(write_shard("base", columns | {"quality/valid": np.array(valid, np.uint8)}, said))
     some = f"{tmp_path}/some.h5"
     for text, x in ((some, 0.2), (f"{some}:0", 0.1), (f"{some}:2", 0.3)):
-        assert parse_pose(wrist_pose(text)) == (x, 0, 0, 1, 0, 0, 0)
+        assert parse_pose(wrist_pose(text, "allegro", "mug", {})) == (x, 0, 0, 1, 0, 0, 0)
     for text, words in ((f"{some}:3", "has 3 grasps"), (f"{tmp_path}/none.h5", "no valid grasp: choose a row")):
         with pytest.raises(InputError, match=words):
-            wrist_pose(text)
-    assert wrist_pose("") == "" and wrist_pose("0, 0, 0, 1, 0, 0, 0") == "0, 0, 0, 1, 0, 0, 0"
+            wrist_pose(text, "allegro", "mug", {})
+    assert wrist_pose("", "", "", {}) == "" and wrist_pose("0, 0, 0, 1, 0, 0, 0", "", "", {}) == "0, 0, 0, 1, 0, 0, 0"
 
 
 def test_free_grasps_are_near_the_pose_and_columns_exist_only_then(plain: SynthesisResult) -> None:
@@ -106,6 +109,39 @@ def test_free_grasps_are_near_the_pose_and_columns_exist_only_then(plain: Synthe
 
 def test_grasps_on_a_table_are_near_the_pose(on_table: SynthesisResult) -> None:
     assert_near(synth(grasps=2, scene="table", scenes=1, budget=16, like=text_of(on_table)), text_of(on_table))
+
+
+def test_grasps_use_the_scenes_in_which_the_palm_has_room() -> None:
+    """The object in the second scene is upside down, so that the pose above it is below the table."""
+    hand, obj = hand_from_path("allegro"), object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.14)))
+    upright, turned = np.array([0, 0, 0.07, 1.0, 0, 0, 0]), np.array([0, 0, 0.07, 0, 1.0, 0, 0])
+    table = supports_of(SceneSpec(kind="table"))
+    common = {"fidelity": "draft", "seed": 2, "validation": "none", "scene": "table", "want": "candidates"}
+
+    def made(count: int, *poses: np.ndarray, **required: str) -> ValidatedBatch:
+        scenes = Scenes(table, np.array(poses))
+        return validated_grasps(hand, obj, JobOptions(**common, **required), count=count, scenes=scenes)
+
+    pose = made(1, upright, approach_cone="0, 0, -1, 30").grasps.grasp.hand_pose[0]
+    like = ", ".join(f"{value:.6f}" for value in pose)
+    both = made(3, turned, upright, like=like)
+    assert both.grasps.scene.tolist() == [1, 1, 1]
+    with pytest.raises(InputError, match=r"blocks the palm of allegro at the demonstrated .* 2 scenes"):
+        made(1, turned, turned, like=like)
+
+
+def test_a_file_with_grasps_of_another_object_or_hand_is_refused(plain: SynthesisResult, tmp_path: Path) -> None:
+    file = tmp_path / "demo.h5"
+    file.write_bytes(write_shard("base", plain.arrays, plain.attributes | {"shard_id": "0" * 32}))
+    for hand, obj, mesh, words in (
+        ("allegro", "block", {}, r"are of another object \(mug\) than block"),
+        ("allegro", "mug", {"scale_to": 0.1}, "or of other mesh options"),
+        ("barrett", "mug", {}, "wrist frames of hands differ: use graspd transfer .* --hand barrett"),
+    ):
+        with pytest.raises(InputError, match=words) as caught:
+            wrist_pose(str(file), hand, obj, mesh)
+        assert "\n" not in str(caught.value)
+    assert parse_pose(wrist_pose(str(file), "allegro", "mug", {}))
 
 
 def test_grasps_of_a_gripper_are_near_the_pose() -> None:

@@ -40,11 +40,11 @@ from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.planners import PlanRequest, synthesize
 from graspd.worker.planners.fast_graspd import starts
-from graspd.worker.planners.fast_graspd.antipodal_starts import ReachSampling, crossings_of
+from graspd.worker.planners.fast_graspd.antipodal_starts import ReachSampling, _is_within_reach, crossings_of
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.pairs import pair_of
 from graspd.worker.planners.fast_graspd.scene_starts import EVERY, REACHING, clear_scene_starts, free_directions
-from graspd.worker.planners.fast_graspd.starts import RETREATS, clear_starts, start_generator
+from graspd.worker.planners.fast_graspd.starts import RETREATS, _Pair, draw_starts, start_generator
 from graspd.worker.planners.requirements import INNER, LEAST_SHARE, NOTHING, Requirements
 from graspd.worker.quality.contact import LINK_CONTACT_M
 from graspd.worker.quality.probe import probe_of
@@ -108,6 +108,18 @@ def approaches(rotation: np.ndarray) -> np.ndarray:
     return quat_rotate(rotation, HAND.palm.approach)
 
 
+def test_pairs_of_a_cone_are_less_than_the_reach_below_the_top() -> None:
+    obj = BAR.centred
+    middle = crossings_of(obj).middle - obj.centre_of_mass
+    up = np.array([0, 0, 1.0])
+    for longest in (0.03, 0.06):
+        inside, top = _is_within_reach(obj, middle, up, longest), np.ptp(obj.vertices[:, 2]) / 2
+        # Samples of the surface stand for its top, with at most 10 mm between them.
+        assert inside[middle[:, 2] > top - longest + 1e-6].all()
+        assert not inside[middle[:, 2] < top - longest - 0.01].any() and 0 < inside.sum() < len(middle)
+    assert _is_within_reach(obj, middle, up, 1.0).all() and _is_within_reach(obj, middle, up, 0.0).all()
+
+
 def test_draws_of_the_kernel_approach_within_the_cone() -> None:
     wanted, pair = required(approach_cone=SIDE), pair_of(HAND, BAR.centred, DRAFT, "cpu")
     drawn = []
@@ -158,7 +170,7 @@ def test_palms_start_before_the_region_and_within_the_cone(place: str) -> None:
     pair = pair_of(HAND, obj, DRAFT, "cpu", in_scenes=not free)
     generators = [start_generator(3, 0, i, k) for i in range(12) for k in range(EVERY)]
     if free:
-        state, _ = clear_starts(pair.model(pair.coarse), generators, each=EVERY, wanted=wanted)
+        state, _ = draw_starts(_Pair(HAND, obj, wanted=wanted), generators)
     else:
         model = pair.model(pair.coarse, DeviceObstacles.create(HAND, placed.scenes, obj.centre_of_mass, "cpu"))
         ways = [wanted.retreats(free_directions(placed.scenes[0], obj), placed, 0)]
@@ -171,7 +183,7 @@ def test_palms_start_before_the_region_and_within_the_cone(place: str) -> None:
     along = state.pivot[:, None] + np.linspace(0, 0.25, 251)[:, None] * approach[:, None]
     off = np.linalg.norm(np.maximum(np.abs(along - [0, 0, 0.055]) - [0.02, 0.02, 0.015], 0), axis=-1).min(axis=1)
     number = np.arange(len(off)) % EVERY
-    assert off[number % 2 == 0 if free else number >= REACHING].max() < 1e-3 and off.max() < 0.05
+    assert off[free | (number >= REACHING)].max() < 1e-3 and off.max() < 0.05
     for end in crossings_of(obj, wanted.region).ends():
         assert len(end) and (end[:, 2] > 0.04 - 1e-9).all()
 

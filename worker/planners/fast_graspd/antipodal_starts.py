@@ -21,6 +21,7 @@ from typing import Any, Final
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from graspd.service.model.transforms import (
     IDENTITY_POSE,
@@ -380,6 +381,8 @@ DRAWS: Final = 512
 LOOKS: Final = 8
 #: Probability of a pair far from the centre of mass, relative to a pair through it.
 FAR_ACROSS: Final = 0.05
+#: Half the width of a palm for the pairs within reach along an approach cone [m].
+PALM_M: Final = 0.02
 #: Number of balls in the hand, and their radius [m]. They touch its surface from inside and protrude from thin links.
 BALLS: Final = 96
 BALL_M: Final = 0.005
@@ -396,8 +399,9 @@ class ReachSampling:
     model: Model
     grips: Any
     only: bool
-    """Whether all starts are antipodal, because the object is too small or too wide for the pads, or its region thin.
-    Starts with the palm towards a random point then rarely succeed."""
+    """Whether all starts are antipodal: in an approach cone, or if the object is too small or too wide for the pads, or
+    its region thin. Starts with the palm towards a random point then rarely succeed. In a cone of 30 degrees from
+    above, Shadow needs 1.6 to 2 times as many attempts with them (mug, bottle)."""
 
     @classmethod
     def of(cls, model: Model, wanted: Requirements = NOTHING) -> ReachSampling | None:
@@ -455,6 +459,9 @@ def _grips(hand: HandModel, obj: ObjectModel, device: str, wanted: Requirements)
     kept = np.flatnonzero(pairs.width + 2 * ROOM_M[0] <= known.widest)
     middle = pairs.middle[kept] - obj.centre_of_mass
     chance = np.exp(-((np.linalg.norm(middle, axis=1) / BESIDE_M) ** 2)) + FAR_ACROSS
+    if wanted.approach is not None:
+        longest = float(np.linalg.norm(known.middle - hand.palm.centre, axis=1).max())
+        chance *= _is_within_reach(obj, middle, -wanted.approach, longest)
     points = sample_surface(hand, BALLS)
     pose = body_poses(hand, np.tile(IDENTITY_POSE, (len(known), 1)), hand.expand(known.q))[:, points.body]
     balls = quat_rotate(pose[..., 3:], points.position - BALL_M * points.normal) + pose[..., :3] - hand.palm.centre
@@ -480,7 +487,7 @@ def _grips(hand: HandModel, obj: ObjectModel, device: str, wanted: Requirements)
         out.palm = wp.vec3(*hand.palm.approach)
         out.noise = wp.array(NOISE * hand.span, dtype=wp.float32)
         out.lower, out.upper = wp.array(hand.lower, dtype=wp.float32), wp.array(hand.upper, dtype=wp.float32)
-    return out, at_pads
+    return out, at_pads or wanted.approach is not None
 
 
 def _pads(hand: HandModel, known: PinchPostures) -> Floats:
@@ -488,3 +495,13 @@ def _pads(hand: HandModel, known: PinchPostures) -> Floats:
     tips = list(hand.fingertips)
     pose = body_poses(hand, np.tile(IDENTITY_POSE, (len(known), 1)), hand.expand(known.q))[:, tips]
     return np.asarray(apply(pose, np.array([fingertip_pad(hand, tip).centre for tip in tips])) - hand.palm.centre)
+
+
+def _is_within_reach(obj: ObjectModel, middle: Floats, back: Floats, longest: float) -> NDArray[np.bool_]:
+    """Return a mask (P,) of pairs with less of the object than `longest` [m] in the direction `back` (3,), behind them.
+    `middle` (P, 3) is relative to the centre of mass [m]. All pairs, if there is none."""
+    surface = region_points(obj, WHOLE)[0] - obj.centre_of_mass
+    above = surface @ back - (middle @ back)[:, None]
+    beside = cdist(middle - np.outer(middle @ back, back), surface - np.outer(surface @ back, back)) < PALM_M
+    inside = np.where(beside, above, 0.0).max(axis=1) < longest
+    return inside if inside.any() else ~inside

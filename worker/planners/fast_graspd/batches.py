@@ -15,7 +15,7 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fast_graspd.scene_starts import free_directions
+from graspd.worker.planners.fast_graspd.scene_starts import free_directions, no_room_error
 from graspd.worker.planners.fast_graspd.schedule import WarmStart, fidelity_in_scenes
 from graspd.worker.planners.fast_graspd.starts import start_generator
 from graspd.worker.planners.port import BatchRequest
@@ -65,6 +65,8 @@ class Batches:
         self.ways: list[Floats] = []
         """Free directions of each scene."""
         for owner, scenes in enumerate(placed):
+            if hand is not None and not self.requirements.has_room(hand, scenes).any():
+                self.fail(owner, no_room_error(hand, len(scenes.object_pose)))
             try:
                 # All batches have scenes here, so `owner` is the number of the batch.
                 self.ways += [

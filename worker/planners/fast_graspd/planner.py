@@ -252,7 +252,8 @@ class _Launch:
         bad = (depths > 1e-3 * MAX_PENETRATION_MM) | (links < max(MIN_CONTACT_LINKS, wanted.links))
         if wanted.is_set and not bad.all():
             fair = np.flatnonzero(~bad)
-            bad[fair] = ~wanted.fulfilled(self.batches.hand or hand, obj, posture.take(fair), self.placed(rows[fair]))
+            whole, placed = self.batches.hand or hand, self.placed(rows[fair])
+            bad[fair] = ~wanted.fulfilled(whole, obj, posture.take(fair), placed, device)
         return bad
 
 

@@ -97,6 +97,13 @@ def free_directions(scene: Environment, obj: ObjectModel) -> Floats:
     return np.asarray(ways[free])
 
 
+def no_room_error(hand: HandModel, scenes: int) -> NoStartFound:
+    return NoStartFound(
+        f"the table or another obstacle blocks the palm of {hand.name} at the demonstrated wrist pose in each of "
+        f"{scenes} scenes: choose another pose or resting face (--faces all)"
+    )
+
+
 def no_start_error(model: Model, wanted: Requirements = NOTHING) -> NoStartFound:
     hand, obj = model.hand.model, model.obj.model
     if wanted.like is not None:

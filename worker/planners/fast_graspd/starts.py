@@ -1,7 +1,7 @@
 """Starts of hands around a free object.
 
 In every second start of a grasp the palm faces a random surface point. The other starts are antipodal
-(`ReachSampling`). All are antipodal if the object is too small or too wide for the pads.
+(`ReachSampling`). All are antipodal in an approach cone, or if the object is too small or too wide for the pads.
 
 A start must not penetrate the object deeply, since hands that start inside a thin wall never leave it.
 
@@ -222,8 +222,7 @@ def clear_starts(
     model: Model, generators: list[np.random.Generator], *, each: int = 1, wanted: Requirements = NOTHING
 ) -> tuple[HandState, Floats]:
     """Return each generator's first clear start, or else its least deep one, and their depths (n,) [m].
-    The second, fourth, ... of the `each` starts of a grasp are antipodal if possible. All are antipodal if the object
-    is too small or too wide for the hand's pads."""
+    The second, fourth, ... of the `each` starts of a grasp are antipodal if possible, or all (`ReachSampling.only`)."""
     hand, obj = model.hand.model, model.obj.model
     count, jaws = len(generators), JawStarts.of(hand, obj, wanted) if wanted.like is None else None
     retreats = RETREATS if jaws is None else JAW_RETREATS
