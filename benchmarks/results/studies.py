@@ -618,17 +618,6 @@ STUDIES: Final = (
         needs=(GPU,),
     ),
     Study(
-        "chart-gpu",
-        "speed against accuracy on a GPU",
-        ("results/chart-gpu/*",),
-        (
-            f"graspd chart --methods fast_graspd --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('025_mug')},"
-            f"{_mesh('006_mustard_bottle')} --fidelities draft,standard,fine --batch 256 --repeats 1 --device cuda:0 "
-            "--out OUT/results/chart-gpu",
-        ),
-        needs=(GPU,),
-    ),
-    Study(
         "demo",
         "pictures in the README",
         ("images/demo-*.png",),

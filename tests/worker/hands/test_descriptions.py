@@ -377,8 +377,8 @@ def test_an_expansion_that_the_machine_ended_refuses_no_hand(code: str, monkeypa
     def other(command: list[str], **options: object) -> object:
         return run([sys.executable, "-c", f"import os, signal; {code}"], **options)  # type: ignore[call-overload]
 
-    monkeypatch.setattr("graspd.worker.hands.xacro.subprocess.run", other)
-    monkeypatch.setattr("graspd.worker.hands.xacro._WALL_LIMIT_S", 0.5 if "pause" in code else 60.0)
+    monkeypatch.setattr("graspd.worker.objects.isolation.subprocess.run", other)
+    monkeypatch.setattr("graspd.worker.objects.isolation._WALL_LIMIT_S", 0.5 if "pause" in code else 60.0)
     with pytest.raises(OSError, match=r"x\.xacro"):
         expand_xacro({"x.xacro": b"<robot/>"}, "x.xacro", {})
 
