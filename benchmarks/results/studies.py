@@ -47,6 +47,10 @@ _TRAIN = (
 )
 
 
+#: Warp's example of a stage.
+_BEAR: Final = "$(python -c 'import warp; print(warp.__path__[0])')/examples/assets/bear.usd"
+
+
 def _mesh(name: str) -> str:
     return f"DATA/objects/{name}/clean.stl"
 
@@ -616,6 +620,16 @@ STUDIES: Final = (
             "--page OUT/results/gpu.md",
         ),
         needs=(GPU,),
+    ),
+    Study(
+        "usd",
+        "grasps of a hand and an object from USD",
+        ("images/usd.png",),
+        (
+            f"graspd synth --hand tests/worker/hands/barrett.usdc --object {_BEAR} --scale-to 0.1 -n 4 -o WORK/usd.h5",
+            "graspd pictures WORK/usd.h5 --palette -o OUT/images/usd.png",
+        ),
+        seeds=(0,),
     ),
     Study(
         "demo",
