@@ -1,7 +1,7 @@
 """Read a hand from MJCF with MuJoCo, which resolves defaults, classes, angles and inertias.
 
 Bodies become links. Several joints of a body become a chain of joints with links between them. Elements that a hand
-does not need, and files outside the upload, never reach MuJoCo: see `worker.hands.mjcf_source`."""
+does not need, and files outside the upload, never reach MuJoCo: see `worker.objects.mjcf_source`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ import numpy as np
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from graspd.worker.hands.mjcf_drives import Couplings, bodies_to_root, commanded_ranges, servo_parameters
-from graspd.worker.hands.mjcf_source import inline_model
 from graspd.worker.hands.primitives import hull
 from graspd.worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, build_robot
 from graspd.worker.hands.tree import joint_motion
+from graspd.worker.objects.mjcf_source import inline_model
 
 _FREE, _HINGE, _SLIDE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "HINGE", "SLIDE"))
 #: Colour that MuJoCo gives to a geom without a stated colour; such a geom has its material's colour.

@@ -14,8 +14,8 @@ from typing import Final
 
 from graspd.service.model.errors import HandError, LimitError
 from graspd.service.store.mesh_files import match_name
-from graspd.worker.hands.urdf import parse_xml
 from graspd.worker.objects.format_check import check_format
+from graspd.worker.objects.xml_document import parse_xml
 
 MAX_BYTES: Final = 8 * 2**20
 _MAX_INCLUDES: Final = 64
@@ -154,7 +154,7 @@ def _find_file(wanted: str, files: Mapping[str, bytes], folders: list[str], main
             return name
         like.append(match_name(name, files))
     if not inside:
-        raise HandError(f"{main}: {does} {wanted[:80]!r}, which lies outside the hand's folder; put it inside")
+        raise HandError(f"{main}: {does} {wanted[:80]!r}, which lies outside its folder; put it inside")
     below = [name for name in files if name.endswith("/" + posixpath.normpath(path).removeprefix("../"))]
     if len(below) == 1:
         return below[0]
