@@ -17,7 +17,7 @@ from xml.etree.ElementTree import Element
 import manifold3d
 import numpy as np
 
-from graspd.service.model.errors import GraspdError, HandError, LimitError, MeshError
+from graspd.service.model.errors import HandError, MeshError
 from graspd.service.model.matter import MOST_KG
 from graspd.service.model.transforms import Floats, pose_to_matrix, quat_from_axis_angle, quat_multiply
 from graspd.service.store.assets import pack, unpack
@@ -27,19 +27,18 @@ from graspd.service.store.mesh_files import find_mesh
 from graspd.worker.objects.formats import READERS, Soup, read_mesh
 from graspd.worker.objects.formats.soup import Part, check_soup, join_parts
 from graspd.worker.objects.mesh_geometry import from_manifold
-from graspd.worker.objects.mjcf_source import MAX_BYTES, inline_model
+from graspd.worker.objects.mjcf_source import MAX_BYTES, compile_model
 from graspd.worker.objects.xml_document import parse_xml
 
 #: Coefficient of friction above which a stated one is limited.
 _MOST_FRICTION: Final = 3.0
-_MAX_SHAPES: Final = 1024
 #: Segments of a circle in round primitives: chords stay within 0.13 % of the radius.
 _SEGMENTS: Final = 64
 #: First group that MuJoCo's viewer does not draw.
 _HIDDEN_GROUP: Final = 3
 _UNKNOWN: Final = np.full(3, np.nan)
-#: Mass [kg], centre of mass (3,) [m], and inertia (3, 3) about it [kg m^2] or None.
-_Inertial = tuple[float, Floats, Floats | None]
+#: Mass [kg], centre of mass (3,) [m], and inertia (3, 3) about it [kg m^2], nan if not stated.
+_Inertial = tuple[float, Floats, Floats]
 
 
 @dataclass
@@ -71,8 +70,6 @@ def read_body(main: str, packed: bytes) -> list[Soup]:
         return [check_soup(replace(soup, **stated, is_rigid=True)) for soup in soups]
     except HandError as error:
         raise MeshError(str(error)) from None
-    except GraspdError:
-        raise
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         raise MeshError(f"{main}: not a readable description ({str(error)[:80]}); correct it") from None
 
@@ -87,8 +84,7 @@ def _matter(body: _Body) -> dict[str, Any]:
     whole = np.zeros((3, 3))
     for own, at, inertia in body.inertials:
         arm = at - centre
-        # A link without a known inertia leaves that of the body unknown.
-        whole += (np.nan if inertia is None else inertia) + own * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        whole += inertia + own * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     return {"matter": matter | {"mass": mass}, "inertial": (centre, whole / mass)}
 
 
@@ -105,12 +101,9 @@ def _read_links(root: Element, files: Mapping[str, bytes], main: str) -> _Body:
     for link in links:
         place = _pose(link) if root.tag == "sdf" else _link_place(link.get("name", ""), joints)
         for tag, parts in (("visual", body.visuals), ("collision", body.collisions)):
-            for element in link.findall(tag):
-                parts.append(_part(element, place @ _pose(element), files, main, link.get("name", "")))
-        if len(body.visuals) + len(body.collisions) > _MAX_SHAPES:
-            raise LimitError(f"{main}: more than {_MAX_SHAPES} shapes; join them")
+            parts += [_part(one, place @ _pose(one), files, main, link.get("name", "")) for one in link.findall(tag)]
         if (inertial := link.find("inertial")) is not None and (mass := _number(inertial.find("mass"), "value")):
-            body.inertials.append(_inertial(inertial, mass, place @ _pose(inertial)))
+            body.inertials.append(_inertial(mass, place @ _pose(inertial), _moments(inertial.find("inertia"))))
         paths = ("contact/lateral_friction", "collision/surface/friction/ode/mu")
         body.frictions += [_number(one, "value") for one in chain(*map(link.findall, paths))]
     body.frictions += [_number(one, "value") for one in models[0].findall("gazebo/mu1")]
@@ -129,14 +122,17 @@ def _link_place(name: str, joints: list[Element]) -> Floats:
     return place
 
 
-def _inertial(element: Element, mass: float, place: Floats) -> _Inertial:
-    moments = element.find("inertia")
-    if moments is None:
-        return mass, place[:3, 3], None
+def _moments(inertia: Element | None) -> Floats:
+    """Return the stated inertia (3, 3); nan if none is stated."""
     keys = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
-    own = np.reshape([_floats(_value(moments, key, "0"), 1) for key in keys], (3, 3))
+    values = [math.nan] * 9 if inertia is None else [_floats(_value(inertia, key, "0"), 1)[0] for key in keys]
+    return np.reshape(values, (3, 3))
+
+
+def _inertial(mass: float, place: Floats, inertia: Floats) -> _Inertial:
+    """Return the mass, and the centre and inertia of a frame at the 4x4 matrix `place`, in the frame of the body."""
     turn = place[:3, :3]
-    return mass, place[:3, 3], turn @ own @ turn.T
+    return mass, place[:3, 3], turn @ inertia @ turn.T
 
 
 def _part(element: Element, matrix: Floats, files: Mapping[str, bytes], main: str, link: str) -> Part:
@@ -206,12 +202,7 @@ def _read_mjcf(files: Mapping[str, bytes], main: str) -> _Body:
     """Read the geoms of the bodies of an MJCF that move as one, in the frame of their root body."""
     import mujoco  # slow to load
 
-    text, assets, _ = inline_model(files, main)
-    try:
-        model = mujoco.MjModel.from_xml_string(text, assets)
-    except (ValueError, RuntimeError, OSError, mujoco.FatalError) as error:
-        line = " ".join(str(error).replace("XML Error:", "").split())[:200]
-        raise MeshError(f"{main}: MuJoCo rejects it ({line}); correct the model") from None
+    model, text, _ = compile_model(files, main)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     with_geoms = {int(body) for body in model.geom_bodyid} - {0} or {0}
@@ -219,23 +210,20 @@ def _read_mjcf(files: Mapping[str, bytes], main: str) -> _Body:
     if len(roots) != 1 or any(int(kind) != int(mujoco.mjtJoint.mjJNT_FREE) for kind in model.jnt_type):
         raise MeshError(f"{main}: {len(roots)} bodies, or one with joints, are not one rigid body; give it alone")
     frame = np.linalg.inv(_matrix(data.xpos[(root := roots.pop())], data.xmat[root]))
-    found = _Body()
+    found, is_friction_stated = _Body(), re.search(r"<geom\s[^>]*\bfriction=", text)
     for geom in range(model.ngeom):
         if model.geom_bodyid[geom] in with_geoms and model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
             part = _geom_part(model, geom, frame @ _matrix(data.geom_xpos[geom], data.geom_xmat[geom]))
-            touches = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
-            if touches:
+            if model.geom_contype[geom] or model.geom_conaffinity[geom]:
                 found.collisions.append(part)
-                found.frictions.append(float(model.geom_friction[geom][0]))
-            if model.geom_group[geom] < _HIDDEN_GROUP and not touches:
+                # MuJoCo fills in the friction of geoms that state none.
+                found.frictions += [float(model.geom_friction[geom][0])] if is_friction_stated else []
+            elif model.geom_group[geom] < _HIDDEN_GROUP:
                 found.visuals.append(part)
-    # MuJoCo fills in the friction of geoms that state none.
-    found.frictions = found.frictions if re.search(r"<geom\s[^>]*\bfriction=", text) else []
     for body in sorted(with_geoms):
         if (mass := float(model.body_mass[body])) > 1e-8:
             place = frame @ _matrix(data.xipos[body], data.ximat[body])
-            turn = place[:3, :3]
-            found.inertials.append((mass, place[:3, 3], turn @ np.diag(model.body_inertia[body]) @ turn.T))
+            found.inertials.append(_inertial(mass, place, np.diag(model.body_inertia[body])))
     return found
 
 
@@ -243,23 +231,17 @@ def _geom_part(model: Any, geom: int, matrix: Floats) -> Part:
     import mujoco
 
     size, name = [float(value) for value in model.geom_size[geom]], (str(model.geom(geom).name),)
-    match mujoco.mjtGeom(int(model.geom_type[geom])):
-        case mujoco.mjtGeom.mjGEOM_MESH:
-            mesh = int(model.geom_dataid[geom])
-            vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
-            vertices = np.array(model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]], float)
-            faces = np.array(model.mesh_face[face : face + model.mesh_facenum[mesh]], np.int64)
-            return vertices, faces, matrix, _UNKNOWN, name
-        case mujoco.mjtGeom.mjGEOM_SPHERE:
-            solid = _primitive("sphere", size[:1])
-        case mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-            solid, matrix = _primitive("sphere", [1.0]), matrix @ np.diag([*size, 1.0])
-        case mujoco.mjtGeom.mjGEOM_BOX:
-            solid = _primitive("box", [2 * value for value in size])
-        case kind:
-            round_kind = "capsule" if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else "cylinder"
-            solid = _primitive(round_kind, [size[0], 2 * size[1]])
-    return (*solid, matrix, _UNKNOWN, name)
+    if (kind := mujoco.mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_").lower()) == "mesh":
+        mesh = int(model.geom_dataid[geom])
+        vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
+        vertices = np.array(model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]], float)
+        faces = np.array(model.mesh_face[face : face + model.mesh_facenum[mesh]], np.int64)
+        return vertices, faces, matrix, _UNKNOWN, name
+    if kind == "ellipsoid":
+        kind, size, matrix = "sphere", [1.0], matrix @ np.diag([*size, 1.0])
+    # MuJoCo states half lengths.
+    sizes = [2 * value for value in size] if kind == "box" else [size[0], *(2 * value for value in size[1:2])]
+    return (*_primitive(kind, sizes[:1] if kind == "sphere" else sizes), matrix, _UNKNOWN, name)
 
 
 def _matrix(position: Any, rotation: Any) -> Floats:

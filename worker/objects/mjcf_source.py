@@ -10,7 +10,7 @@ import posixpath
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import PurePosixPath
-from typing import Final
+from typing import Any, Final
 
 from graspd.service.model.errors import HandError, LimitError
 from graspd.service.store.mesh_files import match_name
@@ -34,6 +34,18 @@ _DROPPED: Final = frozenset(
     {"file", "content_type", "texture", "hfield", "meshdir", "texturedir", "assetdir", "strippath", "plugin"}
 )
 _MESHES: Final = (".stl", ".obj", ".msh")
+
+
+def compile_model(files: Mapping[str, bytes], main: str) -> tuple[Any, str, list[str]]:
+    """Return MuJoCo's model, its text, and notes for the user; HandError if MuJoCo rejects it; see `inline_model`."""
+    import mujoco  # slow to load
+
+    text, assets, notes = inline_model(files, main)
+    try:
+        return mujoco.MjModel.from_xml_string(text, assets), text, notes
+    except (ValueError, RuntimeError, OSError, mujoco.FatalError) as error:
+        line = " ".join(str(error).replace("XML Error:", "").split())[:200]
+        raise HandError(f"{main}: MuJoCo rejects it ({line}); correct the model") from None
 
 
 def inline_model(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, bytes], list[str]]:
