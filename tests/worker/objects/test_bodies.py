@@ -105,8 +105,15 @@ def test_a_description_gives_scale_place_mass_inertia_and_friction(name: str, te
     np.testing.assert_allclose(half_size.centre_of_mass, model.centre_of_mass / 2, atol=tolerance)
 
 
-def test_an_inertia_that_the_shape_cannot_have_is_computed_and_said_so() -> None:
-    given = URDF.replace("2e-4", "1").replace("1.5e-4", "1").replace('izz="1e-4"', 'izz="0"')
+@pytest.mark.parametrize(
+    ("moments", "z"),
+    # A placeholder, moments of a far larger body, a sum of two below the third, and a centre outside.
+    [((1, 1, 0), 0.003), ((1, 1, 1), 0.003), ((1e-4, 1e-4, 3e-4), 0.003), ((2e-4, 1.5e-4, 1e-4), 0.05)],
+)
+def test_an_inertia_that_the_shape_cannot_have_is_computed_and_said_so(moments: tuple, z: float) -> None:
+    given = URDF.replace("0.003", str(z))
+    for key, old, new in zip(("ixx", "iyy", "izz"), ("2e-4", "1.5e-4", "1e-4"), moments, strict=True):
+        given = given.replace(f'{key}="{old}"', f'{key}="{new}"')
     files = {"b.urdf": given.encode(), **MESH}
     model, report = load(files), check_object(files, "b")
     assert_mass_properties(model, cuboid((SIZE[0], SIZE[2], SIZE[1]), (0.01, 0.0, 0.1)))
