@@ -13,6 +13,8 @@ from graspd.service.model.errors import InputError, LimitError
 from graspd.service.model.names import check_name_length
 from graspd.service.model.states import AssetKind
 from graspd.service.store.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
+from graspd.service.store.body_files import SUFFIXES as BODIES
+from graspd.service.store.body_files import find_body
 from graspd.service.store.descriptions import parse_json_object
 from graspd.service.store.hand_files import SUFFIXES, find_main_file, hand_name
 from graspd.service.store.network_file import NETWORK_FILE, check_size
@@ -20,7 +22,7 @@ from graspd.service.store.usd_layers import SUFFIXES as USD
 
 MAIN_SUFFIXES: Final[dict[AssetKind, tuple[str, ...]]] = {
     AssetKind.HAND: SUFFIXES,
-    AssetKind.OBJECT: (".stl", ".obj", ".ply", ".glb", ".gltf", ".off", *USD),
+    AssetKind.OBJECT: (".stl", ".obj", ".ply", ".glb", ".gltf", ".off", *USD, *BODIES),
     AssetKind.NETWORK: (".npz",),
 }
 _NAME: Final = re.compile(r"[^A-Za-z0-9._-]+")
@@ -70,7 +72,11 @@ def name_of_upload(filename: str) -> str:
 
 def _main_file(kind: AssetKind, upload: str, files: Mapping[str, bytes]) -> str:
     suffixes = MAIN_SUFFIXES[kind]
-    found = [name for name in sorted(files) if PurePosixPath(name).suffix.lower() in suffixes]
+    if body := find_body(files):
+        return body
+    # Other XML files, such as a licence, are no meshes.
+    meshes = tuple(suffix for suffix in suffixes if suffix not in BODIES)
+    found = [name for name in sorted(files) if PurePosixPath(name).suffix.lower() in meshes]
     if not found:
         known = ", ".join(suffixes)
         raise InputError(f"{upload} holds no {kind.value} file; upload one of {known}, or a ZIP of the folder")

@@ -27,8 +27,8 @@ _CHECK_WAIT_S: Final = 15.0
 UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))
 #: Text of each button, by the option that the button sets.
 _FIXES: Final = {
+    "rigid": "Take the parts as one rigid body",
     "keep_largest": "Keep only the largest part",
-    "compound": "Treat the parts as one rigid body",
     "allow_open": "Accept the open mesh",
 }
 #: Options with a value from the user: label and attributes of the field, text of the button.

@@ -30,6 +30,7 @@ from graspd.service.store.asset_options import (
 )
 from graspd.service.store.asset_summary import verdict_line
 from graspd.service.store.assets import pack
+from graspd.service.store.body_files import SUFFIXES as BODIES
 from graspd.service.store.descriptions import parse_json_object
 from graspd.service.store.hand_files import SUFFIXES, find_hand_files, hand_name
 from graspd.service.store.object_sets import SUFFIXES as MESHES
@@ -58,14 +59,12 @@ def add_hand(
 ) -> None:
     """Upload a hand, wait for its check, and report guesses and the self-test on simple shapes."""
     options = hand_options(**options) | provenance(licence, source)
-    with upload_of(file) as (upload, main):
-        said = ({"file": main} if main else {}) | options
-        _add(AssetKind.HAND, upload, name, said, self_test=self_test, shared=shared, wait=wait, url=url, json=json)
+    _add(AssetKind.HAND, file, name, options, self_test=self_test, shared=shared, wait=wait, url=url, json=json)
 
 
 @with_options(ObjectSizeOptions, "asset")
 def add_object(
-    file: Annotated[Path, typer.Argument(help="Mesh, ZIP with one mesh, or folder or ZIP of many objects.")],
+    file: Annotated[Path, typer.Argument(help="Mesh, URDF, SDF, MJCF, ZIP of one, or folder or ZIP of many objects.")],
     name: NameOption = None,
     *,
     options: dict[str, Any],
@@ -114,9 +113,9 @@ def _add(
     url: str | None,
     json: bool,
 ) -> None:
-    with open_client(url) as client:
-        name = name or name_of_upload(file.name)
-        asset = client.upload(kind, file, name=name, options=options, self_test=self_test, shared=shared)
+    with open_client(url) as client, upload_of(file) as (upload, main):
+        name, said = name or name_of_upload(upload.name), ({"file": main} if main else {}) | options
+        asset = client.upload(kind, upload, name=name, options=said, self_test=self_test, shared=shared)
         if wait:
             asset = client.wait_for_check(kind, asset.digest, timeout_s=_SELF_TEST_S if self_test else _CHECK_S)
     show_asset(asset.model_dump(mode="json"), json=json)
@@ -126,8 +125,8 @@ def _add(
 
 @contextmanager
 def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
-    """Yield `path` or a temporary ZIP of all files of the hand, and the main file in this ZIP."""
-    alone = not path.is_dir() and (path.suffix.lower() not in SUFFIXES or not path.is_file())
+    """Yield `path` or a temporary ZIP of all files of the hand or body, and the main file in this ZIP."""
+    alone = not path.is_dir() and (path.suffix.lower() not in (*SUFFIXES, *BODIES) or not path.is_file())
     files, main = ({}, "") if alone else find_hand_files(path)
     if len(files) <= 1 and not path.is_dir():
         yield path, ""

@@ -12,7 +12,7 @@ import typer
 from graspd.api.formatting import count, minute, percent, size
 from graspd.api.uploads import MAIN_SUFFIXES, name_of_upload
 from graspd.client import access_commands, tag_commands
-from graspd.client.add_commands import add_hand, add_network, add_object
+from graspd.client.add_commands import add_hand, add_network, add_object, upload_of
 from graspd.client.client import Client, request_path
 from graspd.client.reports import (
     UrlOption,
@@ -260,7 +260,8 @@ def _asset_name(client: Client, kind: AssetKind, value: str) -> str:
         return value
     if not path.is_file():
         raise InputError(f"there is no file {value}; give a path that exists, or the name of a known {kind.value}")
-    asset = client.upload(kind, path, name=name_of_upload(path.name))
+    with upload_of(path) as (upload, main):
+        asset = client.upload(kind, upload, name=name_of_upload(upload.name), options={"file": main} if main else {})
     if not asset.builtin and (asset := client.wait_for_check(kind, asset.digest)).verdict == "refuse":
         raise InputError(f"refused: {asset.message}")
     return asset.name

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AliasChoices, Field, model_validator
 
 from graspd.service.model.base import Model
 from graspd.service.model.matter import FRICTION, MASS_KG, Density, Friction, Mass
@@ -21,7 +21,12 @@ class MeshOptions(Model):
     units: Annotated[Literal["m", "mm", "cm", "in"], _SIZE] = Field("m", description="unit of the mesh")
     scale_to: Annotated[Positive | None, _SIZE] = Field(None, description="longest extent after scaling [m]")
     keep_largest: Annotated[bool, _READ] = Field(False, description="keep only the largest of several components")
-    compound: Annotated[bool, _READ] = Field(False, description="treat separate components as one rigid body")
+    # `compound` is the name in older files.
+    rigid: Annotated[bool, _READ] = Field(
+        False,
+        validation_alias=AliasChoices("rigid", "compound"),
+        description="take separate components as one rigid body",
+    )
     allow_open: Annotated[bool, _READ] = Field(False, description="accept a mesh that is not watertight")
 
 

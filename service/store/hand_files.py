@@ -30,8 +30,8 @@ DESCRIPTIONS: Final = ("asset.json", "hand.json")
 SUFFIXES: Final = (".urdf", ".xacro", ".xml", ".mjcf", *usd_layers.SUFFIXES)
 #: Suffixes of the files taken from a folder besides its descriptions.
 _TAKEN: Final = (*SUFFIXES, ".yaml", ".yml", ".stl", ".obj", ".ply", ".off", ".glb", ".dae", ".msh")
-_REFERENCE: Final = re.compile(r"""file(?:name)?\s*=\s*["']([^"']+)["']""")
-_FOLDER: Final = re.compile(r"""(?:mesh|asset)dir\s*=\s*["']([^"']*)["']""")
+REFERENCE: Final = re.compile(r"""(?:file(?:name)?\s*=\s*["']|<uri>\s*)([^"'<]+)["'<]""")
+FOLDER: Final = re.compile(r"""(?:mesh|asset)dir\s*=\s*["']([^"']*)["']""")
 _MAX_INCLUDED: Final = 32
 #: Folders of main files in a ROS package; the meshes are in sibling folders.
 _OF_PACKAGES: Final = ("urdf", "robots", "xacro", "mjcf")
@@ -114,8 +114,8 @@ def _referenced_files(path: Path, root: Path) -> set[str]:
         file = waiting.pop()
         text = decode_text(file.read_bytes())
         bases.add(file.parent.relative_to(root).as_posix())
-        folders |= {unescape(folder) for folder in _FOLDER.findall(text)}
-        references |= {unescape(reference) for reference in _REFERENCE.findall(text)}
+        folders |= {unescape(folder) for folder in FOLDER.findall(text)}
+        references |= {unescape(reference) for reference in REFERENCE.findall(text)}
         # Names in an included file are relative to its own folder or to the description's, depending on the reader.
         found = {name for parts in product(references, bases, folders) for name in _resolve_names(*parts, root)}
         for name in sorted(found):
@@ -176,7 +176,7 @@ def format_of(name: str, data: bytes) -> Format | None:
     if suffix in usd_layers.SUFFIXES:
         return "usd"
     text = decode_text(data)
-    found = _FORMATS_OF.get(_root_element(text[:_HEAD_BYTES]))
+    found = _FORMATS_OF.get(root_element(text))
     if found == "urdf" and any(sign in _COMMENT.sub("", text) for sign in _MACROS):
         return "xacro"
     # Without a known root element the suffix decides, and the reader of that format reports the error.
@@ -256,7 +256,7 @@ def _shortest_name(names: list[str]) -> str:
 def hand_name(leaf: str) -> str:
     """Strip the suffixes of the format from a file name: `claw.urdf.xacro` becomes `claw`."""
     path = PurePosixPath(leaf)
-    while path.suffix.lower() in (*SUFFIXES, ".zip"):
+    while path.suffix.lower() in (*SUFFIXES, ".sdf", ".zip"):
         path = path.with_suffix("")
     return path.name
 
@@ -270,8 +270,9 @@ def _read_description_head(files: Mapping[str, bytes], name: str) -> bytes:
     return files[name]
 
 
-def _root_element(head: str) -> str:
-    at = 0
+def root_element(text: str) -> str:
+    """Return the tag of the root element in the head of an XML text; "" if there is none."""
+    head, at = text[:_HEAD_BYTES], 0
     while prolog := _PROLOG.match(head, at):
         at = prolog.end()
     root = _ROOT.match(head, at)

@@ -11,7 +11,7 @@ from pathlib import PurePosixPath
 from typing import Final
 from urllib.parse import unquote
 
-from graspd.service.model.errors import InputError
+from graspd.service.model.errors import HandError, InputError
 from graspd.service.store.assets import check_path
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(/*)")
@@ -37,7 +37,7 @@ def resolve_mesh_reference(written: str, base: str) -> Reference:
     found = _SCHEME.match(text)
     scheme = found[1].lower() if found else ""
     if found and scheme not in _OURS:
-        raise InputError("is no file of this hand; put it beside the URDF")
+        raise InputError("is no file of the upload; put it beside the URDF")
     rest = text[found.end() :] if found else text
     # `..` in a name with a scheme is relative to the package, otherwise to the folder of the description.
     paths = [_resolve_inside(rest, "" if scheme else base)]
@@ -54,6 +54,29 @@ def match_name(name: str, files: Iterable[str]) -> str:
     return like[0] if len(like) == 1 else ""
 
 
+def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
+    """Return the name in `files` of a mesh that a URDF references; see `resolve_mesh_reference`.
+    Without an exact match, return the only file whose path has the same end, else one whose path differs in case.
+    Raises HandError: the mesh is missing, or lies outside the upload."""
+    try:
+        reference = resolve_mesh_reference(filename, base)
+    except InputError as error:
+        raise HandError(f"mesh {filename!r} of link {link!r} {error}") from None
+    for name in reference.names:
+        if name in files:
+            return name
+    for tail in reference.tails:
+        below = [file for file in files if file.endswith("/" + tail)]
+        if len(below) == 1:
+            return below[0]
+    for name in reference.names:
+        if like := match_name(name, files):
+            return like
+    hint = "unknown package: " if reference.scheme == "package" else ""
+    sought = (reference.tails or reference.names)[-1]
+    raise HandError(f"mesh {filename!r} of link {link!r} is not there ({hint}looked for {sought!r}); add the file")
+
+
 def _path_suffixes(path: str) -> list[str]:
     parts = PurePosixPath(path).parts
     return [str(PurePosixPath(*parts[start:])) for start in range(len(parts))]
@@ -65,7 +88,7 @@ def _resolve_inside(path: str, base: str) -> str:
     try:
         return check_path(posixpath.normpath(posixpath.join(base, path)) if dots else path)
     except InputError:
-        raise InputError("lies outside the hand's folder; put it inside") from None
+        raise InputError("lies outside its folder; put it inside") from None
 
 
 #: Maximum number of names read from one file; material libraries have fewer.

@@ -1,4 +1,4 @@
-"""Sets of objects from a folder or ZIP of meshes; the layouts of YCB and EGAD are detected."""
+"""Sets of objects from a folder or ZIP of meshes or descriptions; the layouts of YCB and EGAD are detected."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from typing import Final
 from graspd.service.cli import load_settings
 from graspd.service.model.errors import InputError, LimitError
 from graspd.service.model.names import shorten_name
+from graspd.service.store import body_files
 from graspd.service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
 from graspd.service.store.usd_layers import SUFFIXES as USD
 
 SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb", *USD)
+#: Suffixes of the files that are read, besides `asset.json`.
+_TAKEN: Final = (*SUFFIXES, ".dae", ".msh", *body_files.SUFFIXES)
 #: Stems of mesh files in order of preference, if an object has several meshes: closed and cleaned scans first.
 PREFERRED: Final = ("clean", "nontextured", "textured_simple", "textured", "collision", "visual", "raw")
 #: Names of inner folders that describe the processing of a mesh, not the object.
@@ -37,8 +40,11 @@ def find_set_objects(path: Path) -> Objects | None:
 
 
 def group_objects(files: Mapping[str, bytes]) -> Objects:
-    """Group the files of a set by object: sorted names, each with its mesh and `asset.json`, if any."""
-    meshes = sorted(name for name in files if PurePosixPath(name).suffix.lower() in SUFFIXES)
+    """Group the files of a set by object: sorted names, each with its mesh and `asset.json`, if any.
+    A URDF, SDF or MJCF is an object with the meshes that it names, which are no objects themselves."""
+    named = {name: body_files.referenced_files(files, name) for name in files if body_files.is_body(name, files[name])}
+    used = {inner for main, found in named.items() for inner in found if inner != main}
+    meshes = sorted(n for n in files.keys() - used if n in named or PurePosixPath(n).suffix.lower() in SUFFIXES)
     if not meshes:
         raise InputError(f"no mesh among {len(files)} files; a set holds {', '.join(SUFFIXES)}")
     owners: dict[tuple[str, ...], list[str]] = {}
@@ -52,7 +58,7 @@ def group_objects(files: Mapping[str, bytes]) -> Objects:
         for name in [min(names, key=_preference_key)] if is_object else names:
             parts = owner[len(top) :] if is_object else (*owner[len(top) :], PurePosixPath(name).stem)
             chosen[_unique_name("_".join(parts), chosen)] = name
-    return {name: _object_files(files, mesh) for name, mesh in sorted(chosen.items())}
+    return {name: _object_files(files, mesh, named.get(mesh)) for name, mesh in sorted(chosen.items())}
 
 
 def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
@@ -61,7 +67,7 @@ def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
         return unpack(path.read_bytes(), limit_bytes=limit_bytes)
     root, files, total = path.resolve(), dict[str, bytes](), 0
     for file in sorted(root.rglob("*")):
-        wanted = file.suffix.lower() in SUFFIXES or file.name == "asset.json"
+        wanted = file.suffix.lower() in _TAKEN or file.name == "asset.json"
         if not wanted or not file.is_file() or not file.resolve().is_relative_to(root):
             continue
         total += file.stat().st_size
@@ -103,7 +109,9 @@ def _unique_name(text: str, taken: Mapping[str, str]) -> str:
     return next(name for name in chain([base], numbered) if name not in taken)
 
 
-def _object_files(files: Mapping[str, bytes], mesh: str) -> dict[str, bytes]:
-    path = PurePosixPath(mesh)
-    paths = {path.name: mesh, "asset.json": str(path.parent / "asset.json")}
-    return {name: files[file] for name, file in paths.items() if file in files}
+def _object_files(files: Mapping[str, bytes], main: str, named: dict[str, bytes] | None) -> dict[str, bytes]:
+    """Return the main file, or a description with the files that it names, and an `asset.json` beside it."""
+    path = PurePosixPath(main)
+    described = str(path.parent / "asset.json")
+    found = {path.name: files[main]} if named is None else named
+    return found | ({"asset.json": files[described]} if described in files else {})

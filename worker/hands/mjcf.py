@@ -1,7 +1,7 @@
 """Read a hand from MJCF with MuJoCo, which resolves defaults, classes, angles and inertias.
 
 Bodies become links. Several joints of a body become a chain of joints with links between them. Elements that a hand
-does not need, and files outside the upload, never reach MuJoCo: see `worker.hands.mjcf_source`."""
+does not need, and files outside the upload, never reach MuJoCo: see `worker.objects.mjcf_source`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ import numpy as np
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from graspd.worker.hands.mjcf_drives import Couplings, bodies_to_root, commanded_ranges, servo_parameters
-from graspd.worker.hands.mjcf_source import inline_model
 from graspd.worker.hands.primitives import hull
 from graspd.worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, build_robot
 from graspd.worker.hands.tree import joint_motion
+from graspd.worker.objects.mjcf_source import compile_model
 
 _FREE, _HINGE, _SLIDE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "HINGE", "SLIDE"))
 #: Colour that MuJoCo gives to a geom without a stated colour; such a geom has its material's colour.
@@ -33,12 +33,7 @@ _AT_ORIGIN_M: Final = 1e-12
 def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
     """Read and check an MJCF model.
     Raises HandError: MuJoCo rejects the model, or it is no hand. LimitError: the model is larger than a hand."""
-    text, assets, notes = inline_model(files, main)
-    try:
-        model = mujoco.MjModel.from_xml_string(text, assets)
-    except (ValueError, RuntimeError, OSError, mujoco.FatalError) as error:
-        line = " ".join(str(error).replace("XML Error:", "").split())[:200]
-        raise HandError(f"{main}: MuJoCo rejects it ({line}); correct the model") from None
+    model, _, notes = compile_model(files, main)
     reader = _Reader(model, main, notes)
     roots = reader.roots()
     if len(roots) == 1 and not reader.joints_of(roots[0]):

@@ -17,10 +17,11 @@ from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import HandError, MeshError
 from graspd.service.model.libraries import version_of
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_to_matrix
+from graspd.service.store.mesh_files import find_mesh
 from graspd.worker.hands.model import ConvexPiece
 from graspd.worker.hands.primitives import compute_hull, hull, hull_planes, signed_distance, tessellate, volume
 from graspd.worker.hands.robot import Ints, Shape
-from graspd.worker.hands.visuals import find_mesh, merge_and_thin
+from graspd.worker.hands.visuals import merge_and_thin
 from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts, default_cache, load_parts, save_parts
 from graspd.worker.objects.disk_cache import cached_step
 from graspd.worker.objects.formats import read_mesh

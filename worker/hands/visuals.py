@@ -13,15 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from graspd.service.model.errors import HandError, InputError
+from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, apply
-from graspd.service.store.mesh_files import (
-    MAX_NAMES,
-    appearance_files,
-    match_name,
-    resolve_appearance_file,
-    resolve_mesh_reference,
-)
+from graspd.service.store.mesh_files import MAX_NAMES, appearance_files, find_mesh, resolve_appearance_file
 from graspd.worker.hands.primitives import tessellate
 from graspd.worker.hands.robot import Ints, Shape
 from graspd.worker.objects.formats import Nearby, Soup, read_mesh
@@ -158,26 +152,3 @@ def _file_of(item: PlacedShape, files: Mapping[str, bytes], base: str) -> str:
         return find_mesh(item.shape.filename, files, base, item.link)
     except InputError:
         return ""
-
-
-def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
-    """Return the name in `files` of a mesh that a URDF references; see `resolve_mesh_reference`.
-    Without an exact match, return the only file whose path has the same end, else one whose path differs in case.
-    Raises HandError: the mesh is missing, or lies outside the upload."""
-    try:
-        reference = resolve_mesh_reference(filename, base)
-    except InputError as error:
-        raise HandError(f"mesh {filename!r} of link {link!r} {error}") from None
-    for name in reference.names:
-        if name in files:
-            return name
-    for tail in reference.tails:
-        below = [file for file in files if file.endswith("/" + tail)]
-        if len(below) == 1:
-            return below[0]
-    for name in reference.names:
-        if like := match_name(name, files):
-            return like
-    hint = "unknown package: " if reference.scheme == "package" else ""
-    sought = (reference.tails or reference.names)[-1]
-    raise HandError(f"mesh {filename!r} of link {link!r} is not there ({hint}looked for {sought!r}); add the file")

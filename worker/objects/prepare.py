@@ -22,13 +22,14 @@ from graspd.service.model.errors import MeshError, NotFoundError, did_you_mean
 from graspd.service.model.object_options import ObjectOptions
 from graspd.service.model.states import AssetKind
 from graspd.service.model.transforms import Floats
-from graspd.service.store import usd_layers
+from graspd.service.store import body_files, usd_layers
 from graspd.service.store.assets import builtin_files, builtin_names, unpack_file
-from graspd.worker.objects import disk_cache, mesh_geometry, topology
+from graspd.service.store.hand_files import find_hand_files
+from graspd.worker.objects import bodies, disk_cache, mesh_geometry, topology
 from graspd.worker.objects.distance import MeshDistance, deviation, surface_points
 from graspd.worker.objects.formats import READERS, read_mesh
 from graspd.worker.objects.formats.usd import stage_package
-from graspd.worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
+from graspd.worker.objects.mesh_geometry import MassProperties, corner_normals, mass_properties, signed_volume
 from graspd.worker.objects.model import Ints, ObjectModel
 from graspd.worker.objects.options import OF_MATTER, parse_options
 from graspd.worker.objects.parts import SurfaceParts
@@ -44,7 +45,7 @@ _LIBRARIES: Final = ("numpy", "scipy", "manifold3d", "fast-simplification")
 def load_object(
     files: Mapping[str, bytes], *, name: str, digest: str, face_error_m: float, options: Mapping[str, Any] | None = None
 ) -> ObjectModel:
-    """Load the object in `files`: a mesh (`READERS`), and optionally `asset.json`.
+    """Load the object in `files`: a mesh (`READERS`) or a body (`bodies`), and optionally `asset.json`.
     `digest` is that of the files; `options` override keys of `asset.json` (`ObjectOptions`). The prepared surface lies
     within `face_error_m` of the uploaded one [m]; 0 keeps all faces. Raises MeshError: the mesh cannot be used; the
     message names the fault and the fix."""
@@ -60,16 +61,21 @@ def apply_options(model: ObjectModel, options: ObjectOptions) -> ObjectModel:
 
 
 def main_mesh(files: Mapping[str, bytes], options: ObjectOptions) -> tuple[str, bytes]:
-    """Return name and content of the mesh file; layers of a USD stage become one package."""
-    return stage_package(files, main_file(files, options))
+    """Return name and content of the main file; a description and its meshes, or USD layers, become one ZIP."""
+    main = main_file(files, options)
+    is_body = main.lower().endswith(bodies.SUFFIXES)
+    return (main, bodies.pack_body(files)) if is_body else stage_package(files, main)
 
 
 def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
-    """Return the name of the mesh file: from the options, else the only one; MeshError if there is none."""
+    """Return the name of the main file: from the options, else the only description, else the only mesh.
+    Raises MeshError: there is no such file."""
     if options.file:
         if options.file not in files:
             raise MeshError(f"asset.json names the file {options.file!r}, which is missing")
         return options.file
+    if body := body_files.find_body(files):
+        return body
     found = sorted(name for name in files if Path(name).suffix.lower() in READERS)
     if len(found) == 1:
         return found[0]
@@ -100,10 +106,17 @@ def repaired_mesh(main: str, data: bytes, options: ObjectOptions) -> RepairedMes
 @lru_cache(maxsize=2)
 def _repair_file(main: str, data: bytes, options_json: str) -> RepairedMesh:
     """Repair, cached: the result is reused for every value of `face_error_m`."""
-    soup = read_mesh(main, data)
+    is_body = main.lower().endswith(bodies.SUFFIXES)
+    soup, *others = bodies.read_body(main, data) if is_body else [read_mesh(main, data)]
+    options = ObjectOptions.model_validate_json(options_json)
     try:
-        return repair(soup, ObjectOptions.model_validate_json(options_json))
+        return repair(soup, options)
     except MeshError as error:
+        for other in others:
+            with suppress(MeshError):
+                mesh = repair(other, options)
+                why = f"took the collision shapes, since the visible ones cannot be used ({error})"
+                return replace(mesh, repairs=(why, *mesh.repairs))
         raise MeshError(f"{main}: {error}", facts=error.facts) from None
 
 
@@ -112,6 +125,8 @@ def build_model(mesh: RepairedMesh, face_error_m: float) -> ObjectModel:
     vertices, indices, error = simplify(mesh.vertices, mesh.faces, face_error_m, closed=mesh.watertight)
     faces, (hull_vertices, hull_faces) = indices.astype(np.int32), convex_hull(vertices)
     mass = mass_properties(*((vertices, faces) if mesh.watertight else (hull_vertices, hull_faces)))
+    if mesh.inertial is not None:
+        mass = MassProperties(mass.volume, *mesh.inertial)
     middle = ObjectModel(
         name="",
         digest="",
@@ -165,6 +180,9 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
         raise NotFoundError(f"{path} is neither a file nor a built-in object ({', '.join(known)}){meant}")
     if path.suffix.lower() == ".zip":
         return path.stem, unpack_file(path), {}
+    if path.suffix.lower() in bodies.SUFFIXES:
+        found, main = find_hand_files(path)
+        return object_name(path), {name: file.read_bytes() for name, file in found.items()}, {"file": main}
     found = usd_layers.layer_files(path) if path.suffix.lower() in usd_layers.SUFFIXES else {path.name: path}
     if (beside := path.with_name("asset.json")).is_file():
         found[beside.name] = beside

@@ -61,6 +61,8 @@ class RepairedMesh:
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  # the middle in the file's frame [m]
     parts: SurfaceParts | None = None
     matter: Mapping[str, float] = field(default_factory=dict)  # see `Soup`
+    inertial: tuple[Floats, Floats] | None = None
+    """Stated centre of mass (3,) relative to the middle [m], and inertia (3, 3) about it per unit of mass [m^2]."""
 
     def with_faces(self, vertices: Floats, faces: Indices, repair: str) -> RepairedMesh:
         return replace(self, vertices=vertices, faces=faces, repairs=(*self.repairs, repair))
@@ -71,6 +73,8 @@ def repair(soup: Soup, options: ObjectOptions) -> RepairedMesh:
     Raises MeshError: wrong units, no volume, holes, several components; the message states the fix."""
     try:
         given = _to_metres(soup, options)
+        if soup.is_rigid and not options.keep_largest:
+            options = options.model_copy(update={"rigid": True})
         mesh = _make_solid(given, options)
     except MeshError as error:
         found, unit = centre_points(soup.vertices[np.unique(soup.faces)]), UNITS[options.units]
@@ -78,10 +82,28 @@ def repair(soup: Soup, options: ObjectOptions) -> RepairedMesh:
             raise
         raise MeshError(f"{error}; {_resolution_note(found, unit)}", facts=error.facts) from None
     mesh = replace(mesh, parts=parts_of(soup, given.vertices, given.faces), matter=soup.matter)
+    mesh = _with_inertial(mesh, soup)
     if not mesh.repairs:
         return mesh
     moved = MeshDistance(given.vertices, given.faces).largest(surface_points(mesh.vertices, mesh.faces, _SAMPLES))
     return replace(mesh, moved_m=moved)
+
+
+def _with_inertial(mesh: RepairedMesh, soup: Soup) -> RepairedMesh:
+    """Take the stated centre of mass and inertia if masses inside the bounding box of the mesh can have them."""
+    if soup.inertial is None:
+        return mesh
+    extent, low, high = (f(mesh.vertices, axis=0) for f in (np.ptp, np.min, np.max))
+    unit = float(extent.max() / np.ptp(soup.vertices[np.unique(soup.faces)], axis=0).max())
+    centre, inertia = soup.inertial[0] * unit - mesh.centre, soup.inertial[1] * unit**2
+    moments = np.linalg.eigvalsh(inertia) if np.isfinite(inertia).all() else np.zeros(3)
+    reach = np.maximum(high - centre, centre - low)
+    inside = bool((reach <= extent).all())
+    # Half the sum of the moments is the mean squared distance; no moment exceeds the sum of the other two.
+    if inside and moments[0] > 0 and moments[2] <= 1.001 * moments[:2].sum() and moments.sum() / 2 <= reach @ reach:
+        return replace(mesh, inertial=(centre, inertia))
+    note = "no body of this size has the stated inertia; it is computed for uniform density"
+    return replace(mesh, notes=(*mesh.notes, note)) if np.isfinite(inertia).all() else mesh
 
 
 def _make_solid(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
@@ -282,13 +304,13 @@ def _unite(
     # A cavity is its own shell, of negative volume.
     pieces = [piece for piece in united.decompose() if piece.volume() > 0]
     groups = mesh_geometry.group_solids(pieces, JOINED_M)
-    if len(groups) > 1 and not options.compound:
+    if len(groups) > 1 and not options.rigid:
         if not options.keep_largest:
             raise MeshError.with_fixes(
                 f"the mesh has {len(groups)} separate components",
-                "keep the largest: --keep-largest, take them as one rigid body: --compound, or upload each alone",
+                "take them as one rigid body: --rigid, keep the largest: --keep-largest, or upload each alone",
+                {"rigid": True},
                 {"keep_largest": True},
-                {"compound": True},
             )
         best = united - mesh_geometry.union([piece for group in groups[1:] for piece in group])
         return mesh.with_faces(*mesh_geometry.from_manifold(best), f"kept the largest of {len(groups)} components")

@@ -164,7 +164,7 @@ def test_a_fix_without_its_number_asks_for_it(http: TestClient, services: Servic
 def test_each_suggested_option_is_a_button(http: TestClient, services: Services) -> None:
     told = {
         "Keep only the largest part": {"keep_largest": True},
-        "Treat the parts as one rigid body": {"compound": True},
+        "Take the parts as one rigid body": {"rigid": True},
         "Accept the open mesh": {"allow_open": True},
         "Use palm as root link": {"root": "palm"},
         "Fix wrist at 0": {"fix": {"wrist": 0}},

@@ -65,7 +65,7 @@ HANDS: list[tuple[dict[str, bytes], str]] = [
     ({"runs.xacro": XACRO.format("""<a b="${__import__('os').system('touch ran')}"/>""").encode()}, "__import__"),
     ({"reads.xacro": XACRO.format('<xacro:include filename="/etc/passwd"/>').encode()}, "outside the hand's folder"),
     ({"macros.xacro": XACRO.format('<xacro:macro name="m" params=""/>').encode()}, "it only defines macros"),
-    ({"includes.xml": INCLUDES}, "outside the hand's folder"),
+    ({"includes.xml": INCLUDES}, "outside its folder"),
     ({"bomb.urdf": PARTS, "part.dae": BOMB_DAE}, "too deep"),
 ]
 

@@ -140,10 +140,10 @@ def with_inside(text: str) -> str:
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        (with_inside('<include file="../../etc/passwd"/>'), "outside the hand's folder"),
+        (with_inside('<include file="../../etc/passwd"/>'), "outside its folder"),
         (with_inside('<include file="h.xml"/>'), "includes itself"),
-        (CLAW.replace('file="tip.stl"', 'file="/etc/passwd"'), "outside the hand's folder"),
-        (CLAW.replace('file="tip.stl"', 'file="../../tip.stl"'), "outside the hand's folder"),
+        (CLAW.replace('file="tip.stl"', 'file="/etc/passwd"'), "outside its folder"),
+        (CLAW.replace('file="tip.stl"', 'file="../../tip.stl"'), "outside its folder"),
         (CLAW.replace('file="tip.stl"', 'file="../h.xml"'), "the mesh 'h.xml' is no file of type .stl"),
         pytest.param(with_inside("<light/>" * 50_001), "more than 50000 elements", id="too many elements"),
         (with_inside('<attach model="other" prefix="x"/>'), "<attach>"),

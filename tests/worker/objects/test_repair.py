@@ -221,10 +221,11 @@ def test_parts_within_a_millimetre_are_one_body() -> None:
     apart = boxes(0.0012)
     refused = check_parts(apart)
     assert refused["verdict"] == "refuse"
-    assert {"compound", "keep_largest"} == {key for fix in refused["facts"]["options_suggested"] for key in fix}
-    compound = check_parts(apart, compound=True)
-    assert compound["verdict"] == "accept" and "2 parts that lie apart are one rigid body" in compound["message"]
-    assert compound["facts"]["volume_m3"] == pytest.approx(abs(apart.volume))
+    assert [key for fix in refused["facts"]["options_suggested"] for key in fix] == ["rigid", "keep_largest"]
+    assert refused["message"].index("--rigid") < refused["message"].index("--keep-largest")
+    joined = check_parts(apart, rigid=True)
+    assert joined["verdict"] == "accept" and "2 parts that lie apart are one rigid body" in joined["message"]
+    assert joined["facts"]["volume_m3"] == pytest.approx(abs(apart.volume))
     assert check_parts(apart, keep_largest=True)["facts"]["volume_m3"] == pytest.approx(0.04 * 0.05 * 0.06)
     third = trimesh.creation.box((0.04, 0.05, 0.07)).apply_translation((0, 0, 0.3))
     report = check_parts(trimesh.util.concatenate([boxes(0.0005), third]), keep_largest=True)
@@ -240,6 +241,6 @@ def rattle() -> trimesh.Trimesh:
 
 def test_a_loose_part_in_a_cavity_is_a_part_of_its_own() -> None:
     assert "2 separate components" in check_parts(rattle())["message"]
-    assert check_parts(rattle(), compound=True)["facts"]["volume_m3"] == pytest.approx(rattle().volume)
+    assert check_parts(rattle(), rigid=True)["facts"]["volume_m3"] == pytest.approx(rattle().volume)
     kept = check_parts(rattle(), keep_largest=True)["facts"]["volume_m3"]
     assert kept == pytest.approx(0.04**3 - 0.036**3)

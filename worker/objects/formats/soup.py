@@ -33,6 +33,9 @@ class Soup:
     names: FaceNames | None = None
     matter: Mapping[str, float] = field(default_factory=dict)
     """What the file states of `mass` [kg], `density` [kg/m^3] and `friction`."""
+    inertial: tuple[Floats, Floats] | None = None
+    """Centre of mass (3,) and inertia (3, 3) about it per unit of mass, in the file's unit; None if not stated."""
+    is_rigid: bool = False  # the file states that its parts are one rigid body
 
     def by_colour(self) -> list[tuple[tuple[float, float, float] | None, NDArray[np.intp]]]:
         """Return each colour with the indices of its faces; faces without a colour are under None."""

@@ -10,12 +10,12 @@ import posixpath
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import PurePosixPath
-from typing import Final
+from typing import Any, Final
 
 from graspd.service.model.errors import HandError, LimitError
 from graspd.service.store.mesh_files import match_name
-from graspd.worker.hands.urdf import parse_xml
 from graspd.worker.objects.format_check import check_format
+from graspd.worker.objects.xml_document import parse_xml
 
 MAX_BYTES: Final = 8 * 2**20
 _MAX_INCLUDES: Final = 64
@@ -34,6 +34,18 @@ _DROPPED: Final = frozenset(
     {"file", "content_type", "texture", "hfield", "meshdir", "texturedir", "assetdir", "strippath", "plugin"}
 )
 _MESHES: Final = (".stl", ".obj", ".msh")
+
+
+def compile_model(files: Mapping[str, bytes], main: str) -> tuple[Any, str, list[str]]:
+    """Return MuJoCo's model, its text, and notes for the user; HandError if MuJoCo rejects it; see `inline_model`."""
+    import mujoco  # slow to load
+
+    text, assets, notes = inline_model(files, main)
+    try:
+        return mujoco.MjModel.from_xml_string(text, assets), text, notes
+    except (ValueError, RuntimeError, OSError, mujoco.FatalError) as error:
+        line = " ".join(str(error).replace("XML Error:", "").split())[:200]
+        raise HandError(f"{main}: MuJoCo rejects it ({line}); correct the model") from None
 
 
 def inline_model(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, bytes], list[str]]:
@@ -154,7 +166,7 @@ def _find_file(wanted: str, files: Mapping[str, bytes], folders: list[str], main
             return name
         like.append(match_name(name, files))
     if not inside:
-        raise HandError(f"{main}: {does} {wanted[:80]!r}, which lies outside the hand's folder; put it inside")
+        raise HandError(f"{main}: {does} {wanted[:80]!r}, which lies outside its folder; put it inside")
     below = [name for name in files if name.endswith("/" + posixpath.normpath(path).removeprefix("../"))]
     if len(below) == 1:
         return below[0]
