@@ -115,14 +115,21 @@ STUDIES: Final = (
     ),
     Study(
         "chart",
-        "speed against accuracy: methods, fidelities, settings",
-        ("results/chart.*", "results/sweeps.png"),
+        "speed against accuracy: methods, fidelities",
+        ("results/chart.*",),
         (
             f"graspd chart --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('006_mustard_bottle')},{_mesh('025_mug')},"
-            f"{_mesh('035_power_drill')},{_mesh('011_banana')} --batch 32 --baseline-batch 8 --repeats 2 --sweep "
+            f"{_mesh('035_power_drill')},{_mesh('011_banana')} --batch 32 --baseline-batch 8 --repeats 2 "
             "--out OUT/results",
         ),
         ("graspd chart --quick --hands barrett --objects block --out OUT/results",),
+    ),
+    Study(
+        "sweeps",
+        "speed against accuracy: single settings",
+        ("results/sweeps.*",),
+        (f"python -m benchmarks.sweeps --hand {_ALLEGRO} --object {_mesh('006_mustard_bottle')} --out OUT/results",),
+        ("python -m benchmarks.sweeps --quick --hand barrett --object block --out OUT/results",),
     ),
     Study(
         "scenes-chart",

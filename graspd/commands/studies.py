@@ -183,8 +183,6 @@ def chart(
         list[str] | None, typer.Option(help="Option of a method, METHOD:NAME=VALUE: graspit:steps=40000; repeatable.")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Small run: seconds instead of an hour.")] = False,
-    sweep: Annotated[bool, typer.Option("--sweep", help="Vary the settings of fast_graspd, one at a time.")] = False,
-    knob: Annotated[list[str] | None, typer.Option(help="With --sweep: only this setting; repeatable.")] = None,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
     device: Annotated[str, typer.Option(help="Device: cpu, cuda:0 or auto.")] = "auto",
     out: Annotated[Path | None, typer.Option(help="Folder for chart.json, .csv, .md, .png and .svg.")] = None,
@@ -201,16 +199,11 @@ def chart(
     """Compare methods and fidelities on the same hands and objects: speed, and accuracy in MuJoCo."""
     from graspd.studies.chart.chart import settings_of
     from graspd.studies.chart.report import write
-    from graspd.studies.chart.sweeps import knob_values
-    from graspd.studies.chart.sweeps import sweep_settings as turn
     from graspd.worker.hands.load import hand_from_path
 
     if source is not None:
         _write_chart(_read_chart(source), out, data_dir, publish=publish, json=json)
         return
-    knob_values(knobs=knob or ())  # Report a wrong name before an hour of work.
-    if scene != "free" and sweep:
-        raise InputError("--sweep is for charts of free objects; omit --scene")
     place = _chart_scene(scene)
     on = ExecutionContext(Device(device).resolve(), threads)
     batches, models_around = [_parse_batch(part) for part in _parts(batch)], ROBUST_MODELS
@@ -237,12 +230,7 @@ def chart(
         result = scene_chart(
             models, things, chosen, place, models=models_around, work=work, say=_echo, keep=save_partial
         )
-    result |= said
-    if sweep:
-        result["sweeps"] = turn(
-            models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=on, knobs=knob or (), say=_echo
-        )
-    _write_chart(result, out, data_dir, publish=publish, json=json)
+    _write_chart(result | said, out, data_dir, publish=publish, json=json)
 
 
 def _write_chart(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, publish: bool, json: bool) -> None:

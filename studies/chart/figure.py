@@ -53,7 +53,7 @@ def draw(rows: Rows, files: Sequence[Path]) -> None:
     last.set(xlabel="seconds to the first valid grasp, end to end (less is better)", ylim=(-0.07, 1.04))
     last.set_title("Success under the DexGraspBench protocol", loc="left", fontsize=11)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
-    _save(figure, labels, files)
+    save(figure, labels, files)
 
 
 def draw_hands(
@@ -72,10 +72,10 @@ def draw_hands(
         axes.set_visible(False)
     figure.supylabel(words[0], fontsize=10)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    _save(figure, labels, [file])
+    save(figure, labels, [file])
 
 
-def _save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
+def save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
     place_labels(figure, labels)
     for file in files:
         figure.savefig(file, dpi=150)
@@ -114,7 +114,7 @@ def draw_scenes(rows: Rows, files: Sequence[Path], *, second: str) -> None:
     last.set_title("Lifted, by settings with a lift in every pair", loc="left", fontsize=11)
     panels.flat[5].set_visible(False)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    _save(figure, labels, files)
+    save(figure, labels, files)
 
 
 def _styles(rows: Rows) -> Styles:
@@ -133,7 +133,7 @@ def _draw_panel(
         none = not row[x]
         at = valid_rate_bound(row) if none else row[x]
         bars: dict[str, Any] = {
-            f"{axis}err": _error_bar(row, key) for axis, key in (("x", x), ("y", y)) if f"{key}_low" in row
+            f"{axis}err": error_bar(row, key) for axis, key in (("x", x), ("y", y)) if f"{key}_low" in row
         }
         if none:
             bars |= {"xerr": [[0.55 * at], [0.0]], "xuplims": True}
@@ -146,7 +146,7 @@ def _draw_panel(
         text = (label or _label)(row, rows)
         words = ", ".join(filter(None, (text, f"0 of {row['grasps']}" * none)))
         ends = {
-            f"{axis}_bar": _error_bar_ends(row, key) for axis, key in (("x", x), ("y", y)) if not (none and axis == "x")
+            f"{axis}_bar": error_bar_ends(row, key) for axis, key in (("x", x), ("y", y)) if not (none and axis == "x")
         }
         labels.append(Label(axes, at, row[y], words, colour, **({"x_bar": (0.45 * at, at)} if none else {}), **ends))
     _set_logarithmic(axes, [label.x * (0.5 if "0 of" in label.text else 1.0) for label in labels])
@@ -156,7 +156,7 @@ def _draw_panel(
     return labels
 
 
-def _error_bar_ends(row: Row, key: str) -> tuple[float, float] | None:
+def error_bar_ends(row: Row, key: str) -> tuple[float, float] | None:
     return (row[f"{key}_low"], row[f"{key}_high"]) if f"{key}_low" in row else None
 
 
@@ -174,7 +174,7 @@ def _set_logarithmic(axes: Any, values: Sequence[float]) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _error_bar(row: Row, key: str) -> list[list[float]]:
+def error_bar(row: Row, key: str) -> list[list[float]]:
     return [[max(0.0, row[key] - row[f"{key}_low"])], [max(0.0, row[f"{key}_high"] - row[key])]]
 
 
@@ -190,38 +190,6 @@ def _label(row: Row, rows: Rows) -> str:
 def fidelity_label(row: Row, rows: Rows) -> str:
     """Return the fidelity if the method has several, else no text, because the legend has its name."""
     return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
-
-
-def draw_sweeps(rows: Rows, file: Path) -> None:
-    """Plot a panel per setting: success over speed, a point per value."""
-    knobs = list(dict.fromkeys(row["knob"] for row in rows))
-    columns = 3
-    lines = -(-len(knobs) // columns)
-    figure = new_figure(11, 3.1 * lines)
-    panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
-    labels = []
-    for axes, knob in zip(panels.flat, knobs, strict=False):
-        own = sorted((r for r in rows if r["knob"] == knob), key=lambda r: r["speedup"])
-        axes.plot([r["speedup"] for r in own], [r["gsr"] for r in own], color=COLOURS[0], alpha=0.4)
-        for row in own:
-            face = COLOURS[0] if row["default"] else "white"
-            style = {"fmt": "o", "color": COLOURS[0], "markerfacecolor": face, "markersize": 6}
-            axes.errorbar(row["speedup"], row["gsr"], yerr=_error_bar(row, "gsr"), capsize=2, elinewidth=1, **style)
-            labels.append(
-                Label(axes, row["speedup"], row["gsr"], str(row["value"]), INK, y_bar=_error_bar_ends(row, "gsr"))
-            )
-        axes.set_title(knob, loc="left", fontsize=10)
-        axes.set_ylim(0, 1.05)
-        plain_axes(axes)
-    for axes in panels.flat[len(knobs) :]:
-        axes.set_visible(False)
-    # All panels share an axis from zero, so that differences are comparable.
-    panels.flat[0].set_xlim(0, 1.35 * max(row["speedup"] for row in rows))
-    for axes in panels.flat[len(knobs) - columns : len(knobs)]:
-        axes.tick_params(labelbottom=True)
-    figure.supxlabel("speed relative to the default (filled marker)", fontsize=10)
-    figure.supylabel("success in MuJoCo", fontsize=10)
-    _save(figure, labels, [file])
 
 
 Boxes = NDArray[np.float64]

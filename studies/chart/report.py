@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from graspd.service.model.studies import FILTERED, IN_SCENE, IN_SCENES
-from graspd.studies.chart.figure import SPEED, draw, draw_hands, draw_scenes, draw_sweeps, fidelity_label
+from graspd.studies.chart.figure import SPEED, draw, draw_hands, draw_scenes, fidelity_label
 from graspd.studies.chart.statistics import valid_rate_bound
 from graspd.studies.figures import markdown_table
 
@@ -44,7 +44,7 @@ ACCURACIES: Final = (("dexgraspbench", ".2f"), ("hard", ".2f"), ("robust", ".2f"
 
 
 def write(chart: Row, folder: Path) -> None:
-    """Write chart.{json,csv,md,png,svg}, chart.hands.png, and sweeps.png if there are sweeps."""
+    """Write chart.{json,csv,md,png,svg} and chart.hands.png."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "chart.json").write_text(json.dumps(chart, indent=1, allow_nan=False) + "\n")
     with (folder / "chart.csv").open("w", newline="") as stream:
@@ -62,8 +62,6 @@ def write(chart: Row, folder: Path) -> None:
         draw(chart["summary"], pictures)
         words = ("success under the DexGraspBench protocol", "valid grasps per second, end to end")
         draw_hands(chart["by_hand"], by_hand, key="dexgraspbench", words=words)
-    if chart.get("sweeps"):
-        draw_sweeps(chart["sweeps"], folder / "sweeps.png")
     (folder / "chart.md").write_text(markdown(chart) + "\n")
 
 
@@ -81,14 +79,6 @@ def markdown(chart: Row) -> str:
         "Means over each pair's best ten grasps by ε, as in table 2 of the Fast-Grasp'D paper, then over objects.",
         best_table(chart["runs"]),
     ]
-    if chart.get("sweeps"):
-        one = chart["sweeps"][0]
-        head = (
-            f"{one['hand']} on {one['object']}, {one['grasps']} grasps per value. Each row changes one setting of "
-            "fidelity *standard*; pairs of numbers are for the coarse and the fine phase. Speed is relative to the "
-            "default."
-        )
-        parts += ["## Cost and benefit of each setting", head, "![Settings](sweeps.png)", sweeps_table(chart["sweeps"])]
     return "\n\n".join(part for part in parts if part)
 
 
@@ -127,16 +117,16 @@ def summary_table(rows: Sequence[Row]) -> str:
     )
     found = []
     for row in sorted(rows, key=lambda r: -r[SPEED]):
-        cells = [row["method"], row["fidelity"], row["batch"], _value_with_error(row, SPEED, ".3g")]
+        cells = [row["method"], row["fidelity"], row["batch"], value_with_error(row, SPEED, ".3g")]
         cells += [_format(row["seconds_to_first_valid"], ".2g"), f"{row['valid_per_second']:.3g}"]
         for key, form in ACCURACIES:
-            text = _value_with_error(row, key, form)
+            text = value_with_error(row, key, form)
             cells.append(f"**{text}**" if key in row["front"] else text)
         found.append([*cells, row["grasps"]])
     return markdown_table(headings, found, left=2)
 
 
-def _value_with_error(row: Row, key: str, form: str) -> str:
+def value_with_error(row: Row, key: str, form: str) -> str:
     if row[key] is None:
         return "–"
     half = (row[f"{key}_high"] - row[f"{key}_low"]) / 2
@@ -200,17 +190,6 @@ def best_table(runs: Sequence[Row]) -> str:
 def _mean(rows: Sequence[Row], key: str) -> float:
     known: list[float] = [row[key] for row in rows if row[key] is not None]
     return sum(known) / len(known) if known else float("nan")
-
-
-def sweeps_table(sweeps: Sequence[Row]) -> str:
-    """Return a row per value of a setting: speed and accuracy, and the speed relative to the default."""
-    found = []
-    for row in sweeps:
-        cells = [row["knob"], f"{row['value']}{' (default)' if row['default'] else ''}"]
-        cells += [f"{1.0 / row['grasps_per_second']:.3g}", f"× {row['speedup']:.2f}"]
-        accuracies = (("gsr", ".2f"), ("epsilon", ".3f"), ("pd_mm", ".2f"))
-        found.append([*cells, *(_value_with_error(row, key, form) for key, form in accuracies)])
-    return markdown_table("setting | value | s/grasp | speed | GSR | ε | penetration mm", found, left=2)
 
 
 def time_unit(chart: Row) -> str:

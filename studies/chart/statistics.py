@@ -15,7 +15,7 @@ from graspd.worker.quality.intervals import wilson_interval, wilson_interval_of_
 #: Number of bootstrap draws; error bars are their 2.5 and 97.5 percentiles.
 DRAWS: Final = 400
 BAR: Final = (2.5, 97.5)
-#: Accuracies, and whether more is better. The first three are not in sweeps.
+#: Accuracies, and whether more is better.
 METRICS: Final = {"dexgraspbench": True, "hard": True, "robust": True, "gsr": True, "epsilon": True, "pd_mm": False}
 SPEEDS: Final = ("valid_per_second", "end_to_end_per_second")  # speeds that are plotted against accuracies
 #: Metrics summarised by a cell's median; `gsr` by the mean.

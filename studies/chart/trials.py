@@ -38,10 +38,6 @@ MODELS_SEED: Final = 2**31 + 1
 BEST: Final = 10  # number of best grasps by epsilon per pair, as in table 2 of the paper
 
 
-#: Function from hand, object, number of grasps and seed to grasps.
-Make = Callable[[HandModel, ObjectModel, int, int], GraspSet]
-
-
 @dataclass(frozen=True)
 class Setting:
     """A compared setting: a method with its options at a fidelity."""
@@ -53,7 +49,6 @@ class Setting:
     batch: int = 32  # number of grasps per call; a call is one repeat
     warm: Mapping[str, Any] = field(default_factory=dict)  # options of the call before the first timed one
     run: ExecutionContext = DEFAULT_CONTEXT
-    make: Make | None = None  # alternative planner for sweeps of settings that are not part of a fidelity
 
     def grasps(
         self,
@@ -67,8 +62,6 @@ class Setting:
         warm: bool = False,
     ) -> GraspSet:
         """Plan grasps, in scenes if `placed`; methods with rollouts use `rollout`."""
-        if self.make is not None:
-            return self.make(hand, obj, count, seed)
         options = {**self.options, **(self.warm if warm else {})}
         wanted = PlanRequest(count, self.knobs, seed, placed=placed, rollout=rollout)
         return synthesize(hand, obj, wanted, self.run, method=self.method, options=options)

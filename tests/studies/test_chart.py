@@ -1,4 +1,4 @@
-"""The chart: its contract and statistics, of free grasps and in scenes, and that a sweep changes only what it names."""
+"""The chart: its contract and statistics, of free grasps and in scenes; a sweep changes only what it names."""
 
 import csv
 import itertools
@@ -10,6 +10,9 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from benchmarks.sweeps.__main__ import main as sweep
+from benchmarks.sweeps.settings import KnobValue, knob_values, plan_value, query_per_velocity
+from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.studies import FILTERED, IN_SCENE
 from graspd.service.pipeline.fidelity_choice import cheapest_fidelity
@@ -21,7 +24,6 @@ from graspd.studies.chart.report import markdown
 from graspd.studies.chart.scenes import lift_figures
 from graspd.studies.chart.scenes import summarise_runs as summed_in_scenes
 from graspd.studies.chart.statistics import METRICS, seconds_to_valid, summarise_runs
-from graspd.studies.chart.sweeps import KnobValue, _plan_value, knob_values, query_per_velocity
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
@@ -92,8 +94,6 @@ def test_all_files_are_written_and_agree(made: tuple[dict, Path]) -> None:
         ("--option steps=3", "steps"),
         ("--methods graspit --option graspit:steps=1", "steps"),
         ("--objects nowhere.stl", "nowhere.stl"),
-        ("--sweep --knob volume", "volume"),
-        ("--hands barrett --objects block --scene table --sweep", "omit --scene"),
     ],
 )
 def test_a_wrong_option_is_the_callers_mistake(words: str, says: str) -> None:
@@ -157,13 +157,25 @@ def test_each_knob_has_its_default_once_and_can_be_turned_alone() -> None:
     for knob in {turn.knob for turn in found}:
         assert sum(turn.is_default for turn in found if turn.knob == knob) == 1
     assert [turn.value for turn in knob_values(knobs=["queries"])] == ["shared", "one per velocity"]
+    with pytest.raises(InputError, match="no setting 'volume'; choose from 'hand points'"):
+        knob_values(knobs=["volume"])
+
+
+def test_a_sweep_has_a_row_per_value_relative_to_the_default(tmp_path: Path) -> None:
+    sweep(["--quick", "--hand", "barrett", "--object", "block", "--only", "queries", "--out", str(tmp_path)])
+    rows = json.loads((tmp_path / "sweeps.json").read_text())["rows"]
+    assert [(row["value"], row["default"]) for row in rows] == [("shared", True), ("one per velocity", False)]
+    assert rows[0]["speedup"] == 1.0
+    assert rows[1]["speedup"] == pytest.approx(rows[1]["grasps_per_second"] / rows[0]["grasps_per_second"], rel=1e-4)
+    assert "| queries | shared (default) |" in (tmp_path / "sweeps.md").read_text()
+    assert (tmp_path / "sweeps.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_asking_for_distances_anew_changes_no_grasp() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block")
     little = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 12, "fine_iterations": 5})
     shared, anew = (
-        _plan_value(hand, obj, 2, 0, turn=KnobValue("queries", "", little, change), run=ExecutionContext(threads=1))
+        plan_value(hand, obj, 2, 0, turn=KnobValue("queries", "", little, change), run=ExecutionContext(threads=1))
         for change in (None, query_per_velocity)
     )
     np.testing.assert_array_equal(shared.grasp.hand_pose, anew.grasp.hand_pose)

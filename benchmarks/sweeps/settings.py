@@ -8,14 +8,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Final
 
 import warp as wp
 
+from benchmarks.sweeps import kernels
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
-from graspd.studies.chart import kernels
 from graspd.studies.chart.chart import TRUE_ERROR_M, ChartObject
 from graspd.studies.chart.statistics import rounded_json_value, run_figures
 from graspd.studies.chart.trials import Setting, SettingRuns
@@ -87,6 +86,16 @@ def knob_values(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValu
     return [*found[:2], *(turn for turn in found if turn.knob == "queries")] if quick else found
 
 
+@dataclass(frozen=True)
+class TurnedSetting(Setting):
+    """Setting of the chart that is planned by `plan_value`, because it may not be part of a fidelity."""
+
+    turn: KnobValue = KnobValue("", "default")
+
+    def grasps(self, hand: HandModel, obj: ObjectModel, count: int, seed: int, **_: Any) -> GraspSet:
+        return plan_value(hand, obj, count, seed, turn=self.turn, run=self.run)
+
+
 def sweep_settings(
     hand: HandModel,
     thing: ChartObject,
@@ -107,8 +116,7 @@ def sweep_settings(
     cells: dict[tuple[str, str], SettingRuns] = {}
     for turn in [default, *knob_values(quick, knobs)]:
         if turn is default or not turn.is_default:
-            make = partial(_plan_value, turn=turn, run=run)
-            setting = Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, run=run, make=make)
+            setting = TurnedSetting("fast_graspd", turn.value, turn.fidelity, batch=batch, run=run, turn=turn)
             cells[turn.knob, turn.value] = SettingRuns(
                 setting, hand, thing.load(turn.fidelity.face_error_m), true, pieces
             )
@@ -134,7 +142,7 @@ def sweep_settings(
     return rows
 
 
-def _plan_value(
+def plan_value(
     hand: HandModel, obj: ObjectModel, count: int, seed: int, *, turn: KnobValue, run: ExecutionContext
 ) -> GraspSet:
     began = time.perf_counter()
