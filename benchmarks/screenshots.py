@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import json
 import os
 import shutil
 import subprocess
@@ -24,8 +25,11 @@ from typing import Any, Final
 import httpx
 from PIL import Image
 
+from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
+from graspd.service.store.records import publish_record, scene_chart_kind
+from graspd.service.store.store import open_store
 from tests.browser.conftest import ARGUMENTS
 from tests.waiting import until
 
@@ -79,9 +83,10 @@ def work(client: httpx.Client, supervisor: Supervisor) -> dict[str, str]:
     until(lambda: client.get(f"/v1/jobs/{viewed}").json()["state"] == "succeeded", "the job with views", seconds=WORK_S)
     folder = str(supervisor.settings.data_dir)
     if "card pad trade" not in client.get("/chart").text:
-        for chart in CHARTS:
-            command = [sys.executable, "-m", "graspd", "chart", "--from", str(chart), "--publish", "--data-dir", folder]
-            subprocess.run(command, check=True, cwd=REPOSITORY, stdout=subprocess.DEVNULL)
+        store = open_store(supervisor.settings.resolved_store_url)
+        for chart in (json.loads(file.read_text()) for file in CHARTS):
+            place = SceneSpec.model_validate(chart.get("scene", {}))
+            publish_record(store, scene_chart_kind(place), chart)
     if "reach-title" not in client.get("/stability").text:
         command = [sys.executable, "-m", "graspd", "stability", "--from", str(MAPS), "--publish", "--data-dir", folder]
         subprocess.run(command, check=True, cwd=REPOSITORY, stdout=subprocess.DEVNULL)

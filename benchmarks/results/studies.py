@@ -136,12 +136,12 @@ STUDIES: Final = (
         "grasps planned in scenes, compared with filtered free grasps",
         ("results/scenes-chart/*",),
         (
-            f"graspd chart --scene table --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('025_mug')},"
-            f"{_mesh('006_mustard_bottle')},{_mesh('003_cracker_box')} --batch 24 --baseline-batch 24 --threads 1 "
+            f"python -m benchmarks.scenes_chart --hands {_ALLEGRO} {_BARRETT} --objects {_mesh('025_mug')} "
+            f"{_mesh('006_mustard_bottle')} {_mesh('003_cracker_box')} --batch 24 --baseline-batch 24 --threads 1 "
             "--work WORK/scenes-chart --out OUT/results/scenes-chart",
         ),
         (
-            "graspd chart --scene table --quick --hands barrett --objects block --work WORK/scenes-chart "
+            "python -m benchmarks.scenes_chart --quick --hands barrett --objects block --work WORK/scenes-chart "
             "--out OUT/results/scenes-chart",
         ),
         IN_SCENES,

@@ -20,10 +20,9 @@ from graspd.service.model.errors import InputError, choices_text
 from graspd.service.model.fidelity import FIDELITIES, OFFERED, Fidelity
 from graspd.service.model.metrics import ROBUST_MODELS
 from graspd.service.model.renamed import convert_chart
-from graspd.service.model.scene_spec import SceneSpec, parse_scene
 from graspd.service.model.studies import Stability, parse_stability
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.service.store.records import STABILITY, chart_kind, publish_record
+from graspd.service.store.records import CHARTS, STABILITY, publish_record
 from graspd.service.store.store import open_store
 from graspd.worker.engines.devices import Device
 from graspd.worker.execution_context import ExecutionContext
@@ -187,24 +186,19 @@ def chart(
     device: Annotated[str, typer.Option(help="Device: cpu, cuda:0 or auto.")] = "auto",
     out: Annotated[Path | None, typer.Option(help="Folder for chart.json, .csv, .md, .png and .svg.")] = None,
     remark: Annotated[str, typer.Option(help="Note on the conditions, for the report.")] = "",
-    scene: Annotated[
-        str, typer.Option(help="free, table, bin, shelf or a file; free grasps transferred to it are compared.")
-    ] = "free",
-    work: Annotated[Path | None, typer.Option(help="With --scene: folder in which a stopped run continues.")] = None,
     source: Annotated[Path | None, typer.Option("--from", help="Use a chart.json instead of measuring.")] = None,
     publish: Annotated[bool, typer.Option("--publish", help="Publish to the store, for `fidelity: auto`.")] = False,
     data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Compare methods and fidelities on the same hands and objects: speed, and accuracy in MuJoCo."""
-    from graspd.studies.chart.chart import settings_of
+    from graspd.studies.chart.chart import measure_chart, settings_of
     from graspd.studies.chart.report import write
     from graspd.worker.hands.load import hand_from_path
 
     if source is not None:
         _write_chart(_read_chart(source), out, data_dir, publish=publish, json=json)
         return
-    place = _chart_scene(scene)
     on = ExecutionContext(Device(device).resolve(), threads)
     batches, models_around = [_parse_batch(part) for part in _parts(batch)], ROBUST_MODELS
     if quick:
@@ -220,16 +214,7 @@ def chart(
         if out is not None:
             write(so_far | said, out)
 
-    if place is None:
-        from graspd.studies.chart.chart import measure_chart as run
-
-        result = run(models, things, chosen, repeats=repeats, models=models_around, say=_echo, keep=save_partial)
-    else:
-        from graspd.studies.chart.scenes import scene_chart
-
-        result = scene_chart(
-            models, things, chosen, place, models=models_around, work=work, say=_echo, keep=save_partial
-        )
+    result = measure_chart(models, things, chosen, repeats=repeats, models=models_around, say=_echo, keep=save_partial)
     _write_chart(result | said, out, data_dir, publish=publish, json=json)
 
 
@@ -239,7 +224,7 @@ def _write_chart(result: dict[str, Any], out: Path | None, data_dir: Path | None
     if out is not None:
         write(result, out)
     if publish:
-        _publish(chart_kind(result), result, data_dir)
+        _publish(CHARTS, result, data_dir)
     print_result(result, markdown(result), json=json)
 
 
@@ -251,19 +236,11 @@ def _read_chart(path: Path) -> dict[str, Any]:
         return found
 
     found: dict[str, Any] = _read_record(path, "chart", parse)
+    if "scene" in found:
+        raise InputError(f"{path} is a chart of scenes; benchmarks.scenes_chart writes and publishes those")
     if missing := [key for key in ("summary", "by_hand", "models") if key not in found]:
         raise InputError(f"{path} has no {missing[0]}, because an earlier graspd wrote it; measure again")
     return found
-
-
-def _chart_scene(scene: str) -> SceneSpec | None:
-    if scene == "free":
-        return None
-    spec = parse_scene(scene)
-    if spec.neighbours:
-        raise InputError(f"{scene} has neighbours, which a chart does not support; remove them")
-    # The object is dropped onto each of its stable faces.
-    return spec if spec.target is not None else parse_scene(scene, faces="all")
 
 
 def _without_folders(word: str) -> str:

@@ -98,7 +98,7 @@ def _no_chart_text(request: JobRequest) -> str:
     asked, named = ("FILE", "of a scene file with the same supports") if scene == "file" else (scene, f"in a {scene}")
     return (
         f"fidelity auto needs a chart of scenes, here {named}, because charts of free objects have no lifts: run "
-        f"`graspd chart --scene {asked} --publish` once, or name a fidelity"
+        f"`python -m benchmarks.scenes_chart --scene {asked} --publish` once in a checkout, or name a fidelity"
     )
 
 
@@ -125,7 +125,7 @@ def cheapest_fidelity(chart: Row, target: str, *, method: str, hand: str, object
     in_scene = "scene" in chart
     metric, bound = parse_target(target, in_scene=in_scene)
     more = (IN_SCENES if in_scene else FREE)[metric]
-    again = f"`graspd chart {'--scene ... ' if in_scene else ''}--publish`"
+    again = f"`{'python -m benchmarks.scenes_chart' if in_scene else 'graspd chart'} --publish`"
     runs = [run for run in chart["runs"] if run["method"] == method and run["fidelity"] in OFFERED]
     runs = [run for run in runs if run.get("way", IN_SCENE) == IN_SCENE]
     if not runs:

@@ -179,10 +179,6 @@ def scene_chart_kind(place: SceneSpec) -> str:
     return f"{IN_SCENES}/file-{digest_json(content)[:12]}"
 
 
-def chart_kind(chart: Mapping[str, Any]) -> str:
-    return scene_chart_kind(SceneSpec.model_validate(chart["scene"])) if "scene" in chart else CHARTS
-
-
 def scene_kinds(store: Store) -> list[str]:
     return sorted({key.rpartition("/")[0] for key in _keys(store, IN_SCENES) if key.endswith(".json")})
 

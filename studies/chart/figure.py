@@ -20,19 +20,13 @@ Rows = Sequence[Row]
 PointLabel = Callable[[Row, Rows], str]  # function from a point's row and all rows to its label
 Styles = Mapping[str, tuple[str, str]]  # colour and marker of each method
 
-#: Title and key of each accuracy of charts of free objects, and of charts of scenes.
+#: Title and key of each accuracy.
 PANELS: Final = (
     ("Success under the DexGraspBench protocol", "dexgraspbench"),
     ("Success at half the friction", "hard"),
     ("Robust share of held grasps", "robust"),
     ("ε (median)", "epsilon"),
     ("Penetration, mm (median; less is better)", "pd_mm"),
-)
-IN_SCENES: Final = (
-    ("Lifted, share of all candidates", "lift"),
-    ("Lifted under the DexGraspBench protocol", "lift_dexgraspbench"),
-    ("Lifted at half the friction", "lift_hard"),
-    ("Robust share of lifted grasps", "robust"),
 )
 SPEED: Final = "end_to_end_per_second"
 #: Keys of accuracies that are shares.
@@ -44,12 +38,12 @@ def draw(rows: Rows, files: Sequence[Path]) -> None:
     """Plot accuracies over valid grasps per second, and success over seconds to the first valid grasp."""
     figure = new_figure(15.5, 8.6)
     panels = figure.subplots(2, 3)
-    styles, words = _styles(rows), "valid grasps per second, end to end"
+    styles, words = method_styles(rows), "valid grasps per second, end to end"
     labels = []
     for axes, (title, key) in zip(panels.flat[:5], PANELS, strict=True):
-        labels += _draw_over_speed(axes, rows, styles, key, title, words)
+        labels += draw_over_speed(axes, rows, styles, key, title, words)
     last, timed = panels.flat[5], [row for row in rows if row["seconds_to_first_valid"]]
-    labels += _draw_panel(last, timed, styles, x="seconds_to_first_valid", y="dexgraspbench")
+    labels += draw_panel(last, timed, styles, x="seconds_to_first_valid", y="dexgraspbench")
     last.set(xlabel="seconds to the first valid grasp, end to end (less is better)", ylim=(-0.07, 1.04))
     last.set_title("Success under the DexGraspBench protocol", loc="left", fontsize=11)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
@@ -64,10 +58,10 @@ def draw_hands(
     lines = -(-len(by_hand) // columns)
     figure = new_figure(5.4 * max(columns, 2), 4.6 * lines)
     panels = figure.subplots(lines, columns, squeeze=False)
-    styles = _styles([row for rows in by_hand.values() for row in rows])
+    styles = method_styles([row for rows in by_hand.values() for row in rows])
     labels = []
     for axes, (hand, rows) in zip(panels.flat, by_hand.items(), strict=False):
-        labels += _draw_over_speed(axes, rows, styles, key, hand, words[1], label)
+        labels += draw_over_speed(axes, rows, styles, key, hand, words[1], label)
     for axes in panels.flat[len(by_hand) :]:
         axes.set_visible(False)
     figure.supylabel(words[0], fontsize=10)
@@ -81,12 +75,12 @@ def save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
         figure.savefig(file, dpi=150)
 
 
-def _draw_over_speed(
+def draw_over_speed(
     axes: Any, rows: Rows, styles: Styles, key: str, title: str, words: str, label: PointLabel | None = None
 ) -> list[Label]:
     """Plot one accuracy over the speed, with the Pareto front; return the labels of the points."""
     known = [row for row in rows if row[key] is not None]
-    labels = _draw_panel(axes, known, styles, x=SPEED, y=key, label=label)
+    labels = draw_panel(axes, known, styles, x=SPEED, y=key, label=label)
     front = sorted((row for row in known if key in row["front"] and row[SPEED]), key=lambda row: row[SPEED])
     style = {"color": INK, "linewidth": 1, "linestyle": "--", "alpha": 0.6, "zorder": 1, "label": "Pareto front"}
     axes.step([row[SPEED] for row in front], [row[key] for row in front], where="pre", **style)
@@ -97,32 +91,12 @@ def _draw_over_speed(
     return labels
 
 
-def draw_scenes(rows: Rows, files: Sequence[Path], *, second: str) -> None:
-    """Plot shares of candidates over speed, and over time to the first lifted grasp.
-    Speed is in lifted grasps per `second`, the unit of time."""
-    figure = new_figure(15.5, 8.6)
-    panels = figure.subplots(2, 3)
-    styles = _styles(rows)
-    words = f"lifted grasps per {second}, end to end"
-    labels = []
-    for axes, (title, key) in zip(panels.flat[:4], IN_SCENES, strict=True):
-        labels += _draw_over_speed(axes, rows, styles, key, title, words, fidelity_label)
-    timed = [row for row in rows if row["seconds_to_first"]]
-    last = panels.flat[4]
-    labels += _draw_panel(last, timed, styles, x="seconds_to_first", y="lift", label=fidelity_label)
-    last.set(xlabel=f"{second}s to the first that is lifted (less is better)", ylim=(-0.07, 1.07))
-    last.set_title("Lifted, by settings with a lift in every pair", loc="left", fontsize=11)
-    panels.flat[5].set_visible(False)
-    figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    save(figure, labels, files)
-
-
-def _styles(rows: Rows) -> Styles:
+def method_styles(rows: Rows) -> Styles:
     methods = list(dict.fromkeys(row["method"] for row in rows))
     return {m: (COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, m in enumerate(methods)}
 
 
-def _draw_panel(
+def draw_panel(
     axes: Any, rows: Rows, styles: Styles, *, x: str, y: str, label: PointLabel | None = None
 ) -> list[Label]:
     shown: set[str] = set()
@@ -185,11 +159,6 @@ def _label(row: Row, rows: Rows) -> str:
         return str(row["method"])
     several = len({r["batch"] for r in own}) > 1
     return f"{row['fidelity']}, {row['batch']}" if several else str(row["fidelity"])
-
-
-def fidelity_label(row: Row, rows: Rows) -> str:
-    """Return the fidelity if the method has several, else no text, because the legend has its name."""
-    return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
 
 
 Boxes = NDArray[np.float64]

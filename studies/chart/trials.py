@@ -23,7 +23,6 @@ from graspd.worker.planners import Rollout as Tried
 from graspd.worker.quality.gate import passes_gate
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.rollout import create_rollout
-from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.robust import validate_robustness
@@ -57,13 +56,12 @@ class Setting:
         count: int,
         seed: int,
         *,
-        placed: PlacedGrasps | None = None,
         rollout: Tried | None = None,
         warm: bool = False,
     ) -> GraspSet:
-        """Plan grasps, in scenes if `placed`; methods with rollouts use `rollout`."""
+        """Plan grasps; methods with rollouts use `rollout`."""
         options = {**self.options, **(self.warm if warm else {})}
-        wanted = PlanRequest(count, self.knobs, seed, placed=placed, rollout=rollout)
+        wanted = PlanRequest(count, self.knobs, seed, rollout=rollout)
         return synthesize(hand, obj, wanted, self.run, method=self.method, options=options)
 
 

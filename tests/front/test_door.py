@@ -100,7 +100,7 @@ _TYPED = """
     datasets create x --spec FILE.toml; datasets estimate --spec FILE.json
     hands check FILE.urdf; hands check FILE.zip; objects check FILE.zip; objects check FILE.stl
     bench --hand FILE.urdf
-    chart --from FILE.json; chart --scene FILE.json --quick; stability --from FILE.json
+    chart --from FILE.json; stability --from FILE.json
     submit --hand allegro --object mug --scene FILE.json
 """
 COMMANDS = (

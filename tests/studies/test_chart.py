@@ -10,6 +10,11 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from benchmarks.scenes_chart.__main__ import main as scenes_chart
+from benchmarks.scenes_chart.__main__ import scene_of
+from benchmarks.scenes_chart.comparison import lift_figures
+from benchmarks.scenes_chart.comparison import summarise_runs as summed_in_scenes
+from benchmarks.scenes_chart.report import markdown as scenes_page
 from benchmarks.sweeps.__main__ import main as sweep
 from benchmarks.sweeps.settings import KnobValue, knob_values, plan_value, query_per_velocity
 from graspd.service.model.errors import InputError
@@ -21,8 +26,6 @@ from graspd.service.store.store import open_store
 from graspd.studies.chart.chart import settings_of
 from graspd.studies.chart.figure import Label, place_labels
 from graspd.studies.chart.report import markdown
-from graspd.studies.chart.scenes import lift_figures
-from graspd.studies.chart.scenes import summarise_runs as summed_in_scenes
 from graspd.studies.chart.statistics import METRICS, seconds_to_valid, summarise_runs
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
@@ -39,7 +42,7 @@ CROWDS = {
     "in the corners": [(1.0, 0.0), (100.0, 1.0), (1.0, 1.0), (100.0, 0.0)],
     "at the same place": [(3.0, 0.3), (3.0, 0.3), (3.0, 0.3)],
 }
-ON_TABLE = f"{QUICK} --scene table"
+ON_TABLE = ["--quick", "--methods", "fast_graspd", "autograsp", "--hands", "barrett", "--objects", "block"]
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +105,8 @@ def test_a_wrong_option_is_the_callers_mistake(words: str, says: str) -> None:
 
 def test_a_chart_in_scenes_with_neighbours_is_refused(tmp_path: Path) -> None:
     (tmp_path / "s.json").write_text('{"supports": [{"kind": "half_space"}], "neighbours": [{"object": "block"}]}')
-    assert "neighbours, which a chart does not support" in refused("chart --quick --scene", tmp_path / "s.json")
+    with pytest.raises(InputError, match="neighbours, which a chart does not support"):
+        scene_of(str(tmp_path / "s.json"))
 
 
 def test_method_can_be_charted_with_options_and_batch_of_its_own() -> None:
@@ -215,7 +219,8 @@ def test_a_word_alone_stands_close_to_its_point() -> None:
 @pytest.fixture(scope="module")
 def in_scenes(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path]:
     folder = tmp_path_factory.mktemp("chart")
-    return graspd(f"{ON_TABLE} --work", folder / "work", "--out", folder), folder
+    publish = ["--publish", "--data-dir", str(folder / "data")]
+    return scenes_chart([*ON_TABLE, "--work", str(folder / "work"), "--out", str(folder), *publish]), folder
 
 
 def test_rates_and_files_are_those_of_the_runs(in_scenes: tuple[dict, Path]) -> None:
@@ -247,18 +252,25 @@ def test_a_run_that_was_stopped_plans_only_what_is_missing(in_scenes: tuple[dict
         planned.append((setting.method, way))
         return runs[setting.method, way]
 
-    monkeypatch.setattr("graspd.studies.chart.scenes._run_setting", tried)
-    assert graspd(f"{ON_TABLE} --work", folder / "work")["runs"] == found["runs"] and len(planned) == 1
+    monkeypatch.setattr("benchmarks.scenes_chart.comparison._run_setting", tried)
+    again = scenes_chart([*ON_TABLE, "--work", str(folder / "work")])
+    assert again["runs"] == found["runs"] and len(planned) == 1
 
 
-def test_a_chart_of_earlier_is_published_apart_and_drawn(in_scenes: tuple[dict, Path], tmp_path: Path) -> None:
-    found, folder = in_scenes
+def test_a_chart_of_earlier_is_published_and_drawn(made: tuple[dict, Path], tmp_path: Path) -> None:
+    found, folder = made
     graspd("chart --publish --from", folder / "chart.json", "--data-dir", tmp_path, "--out", tmp_path)
-    store = open_store((tmp_path / "store").as_uri())
-    stored = latest_record(store, "scene_charts/table")
-    assert stored is not None and stored["runs"] == found["runs"] and latest_record(store, "charts") is None
+    stored = latest_record(open_store((tmp_path / "store").as_uri()), "charts")
+    assert stored is not None and stored["runs"] == found["runs"]
     assert (tmp_path / "chart.json").read_bytes() == (folder / "chart.json").read_bytes()
     assert (tmp_path / "chart.md").read_text() == (folder / "chart.md").read_text()
+
+
+def test_a_chart_of_scenes_is_published_apart(in_scenes: tuple[dict, Path]) -> None:
+    found, folder = in_scenes
+    store = open_store((folder / "data" / "store").as_uri())
+    stored = latest_record(store, "scene_charts/table")
+    assert stored is not None and stored["runs"] == found["runs"] and latest_record(store, "charts") is None
     # What it promises is what a job in such a scene is given.
     draft = next(run for run in found["runs"] if run["way"] == IN_SCENE)
     chosen = cheapest_fidelity(stored, f"lift>={draft['lift']}", method="fast_graspd", hand="barrett", object_="block")
@@ -266,7 +278,12 @@ def test_a_chart_of_earlier_is_published_apart_and_drawn(in_scenes: tuple[dict, 
 
 
 @pytest.mark.parametrize(
-    ("content", "words"), [("{}", "is no chart.json"), ('{"created": "c", "runs": []}', "has no summary")]
+    ("content", "words"),
+    [
+        ("{}", "is no chart.json"),
+        ('{"created": "c", "runs": []}', "has no summary"),
+        ('{"created": "c", "runs": [], "scene": {}}', "is a chart of scenes"),
+    ],
 )
 def test_a_file_that_is_no_chart_is_refused_in_a_line(tmp_path: Path, content: str, words: str) -> None:
     (tmp_path / "chart.json").write_text(content)
@@ -299,5 +316,5 @@ def test_a_pair_that_is_refused_counts_as_tries_without_a_lift() -> None:
     assert row["lift"] == 0.25 and row["grasps_per_second"] == pytest.approx(10.0)
     assert row["valid_per_second"] == pytest.approx(5.0)
     chart = {"runs": [refused], "summary": [row], "by_hand": {}, "models": 2, "versions": {"graspd": "0"}}
-    said = markdown(chart | {"device": "d", "created": "c", "scene": {"kind": "table", "faces": "all"}})
+    said = scenes_page(chart | {"device": "d", "created": "c", "scene": {"kind": "table", "faces": "all"}})
     assert "## Refused" in said and "nothing can reach it" in said

@@ -39,7 +39,7 @@ def test_a_job_in_a_scene_with_auto_says_how_it_was_chosen(http: TestClient, ser
     scene = {**JOB, "views": 0, "scene": "table"}
     wanted = scene | {"fidelity": "auto", "target": "lift>=0.8"}
     refused = http.post("/v1/jobs", json=wanted)
-    assert refused.status_code == 422 and "graspd chart --scene table --publish" in refused.text
+    assert refused.status_code == 422 and "benchmarks.scenes_chart --scene table --publish" in refused.text
     key = publish_record(services.store, "scene_charts/table", scene_chart())
     answer = http.post("/v1/jobs", json=wanted)
     choice = {"target": "lift>=0.8", "chart": key, "measured_on": "hand and object", "reached": 0.85}

@@ -127,7 +127,9 @@ def test_a_free_chart_is_no_chart_of_scenes_nor_the_reverse(services: Services) 
     with pytest.raises(InputError, match="run `graspd chart --publish` once"):
         job_actions.submit(services, request(fidelity="auto", target="gsr>=0.6"))
     publish_record(services.store, "charts", CHART)
-    with pytest.raises(InputError, match=r"have no lifts: run `graspd chart --scene shelf --publish` once"):
+    with pytest.raises(
+        InputError, match=r"have no lifts: run `python -m benchmarks.scenes_chart --scene shelf --publish` once"
+    ):
         job_actions.submit(services, request(fidelity="auto", target="lift>=0.6", scene="shelf"))
 
 

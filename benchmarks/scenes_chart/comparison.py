@@ -28,7 +28,7 @@ from graspd.studies.chart.trials import FRICTION, MODELS_SEED, SEED, WARM_SEED, 
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners import method
+from graspd.worker.planners import PlanRequest, method, synthesize
 from graspd.worker.quality.intervals import wilson_interval, wilson_interval_of_mean
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.kinds import rest_poses, supports_of
@@ -88,7 +88,7 @@ def scene_chart(
 ) -> Row:
     """Run all settings on all pairs; a setting's `batch` is its number of grasps per pair.
     Each lifted grasp is lifted again in `models` models around the nominal one. An interrupted run resumes from the
-    results in the folder `work`. `say`, `keep` and the result are as in `chart`."""
+    results in the folder `work`. `say`, `keep` and the result are as in `measure_chart`."""
     runs: list[Row] = []
     for thing in things:
         place = ObjectScenes(thing, spec)
@@ -145,8 +145,10 @@ def _run_setting(setting: Setting, way: str, hand: HandModel, place: ObjectScene
     in_scene = way == IN_SCENE
 
     def plan(placed: PlacedGrasps, seed: int, warm: bool = False) -> GraspSet:
-        there: dict[str, Any] = {"placed": placed, "rollout": rollout} if in_scene else {}
-        return setting.grasps(hand, obj, len(placed.index), seed, warm=warm, **there)
+        options = {**setting.options, **(setting.warm if warm else {})}
+        where: dict[str, Any] = {"placed": placed, "rollout": rollout} if in_scene else {}
+        wanted = PlanRequest(len(placed.index), setting.knobs, seed, **where)
+        return synthesize(hand, obj, wanted, setting.run, method=setting.method, options=options)
 
     try:
         rollout = lift_rollout(hand, obj, lambda: place.pieces) if in_scene else None
