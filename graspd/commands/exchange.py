@@ -27,7 +27,7 @@ app = CommandGroup(no_args_is_help=True)
 #: Formats of robots and their simulators; `moveit` and `urdf+yaml` are the same format.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
 TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
-EXPORTS: Final = ("images", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
+EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
 IMPORTS: Final = (
     *("dexgraspbench", "dexlearn", "graspgen", "huggingface", "lerobot"),
     *("dexgraspnet", "dexgraspnet2", "multidex", "ddgc", "reference"),
@@ -166,10 +166,14 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
 
 
 def _export_pictures(source: Path, format_: str, depth: str, output: Path) -> ExportSummary:
+    from graspd.exchange import replicator
     from graspd.worker.rendering.export import export_images
 
     views = read_shard(source, kind="views")
-    written = export_images(views, output, depth="exr" if depth == "exr" else "png")
+    if format_ == "replicator":
+        written = replicator.write(views, output)
+    else:
+        written = export_images(views, output, depth="exr" if depth == "exr" else "png")
     return ExportSummary({"pictures": len(views["camera/eye"]), "files": len(written)})
 
 

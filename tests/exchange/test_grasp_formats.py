@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from graspd.client.dataset_commands import read_spec
 from graspd.commands.exchange import read_sets
 from graspd.commands.studies import _read_record as read_study
-from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, published, webdataset
+from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, published, replicator, webdataset
 from graspd.exchange.bench_hand import _read_mapping as read_mapping
 from graspd.exchange.bench_scene import object_of_scene, save_record
 from graspd.exchange.imported import Origin, joints_by_name, load_npy, parse_verdicts, scaled_object
@@ -34,6 +34,7 @@ from graspd.service.store.store import open_store
 from graspd.studies.cards.contents import Contents, add_provenance
 from graspd.worker.files.provenance import parse_options_attribute, scenes_of_shard
 from graspd.worker.hands.load import hand_from_path
+from graspd.worker.rendering.annotate import box_corners
 from tests.api import factories
 from tests.indexes import open_services
 from tests.worker.commands_run import refused
@@ -312,6 +313,60 @@ def test_an_attribute_that_is_nested_deep_says_nothing() -> None:
 
 
 H, W = 24, 32
+K = np.array([[30.0, 0, 17], [0, 28, 11], [0, 0, 1]])
+#: World to camera: somewhere above, looking at the origin.
+CAMERA = np.eye(4)
+CAMERA[:3, :3] = Rotation.from_euler("xyz", [2.6, 0.2, 0.4]).as_matrix()
+CAMERA[:3, 3] = [0.02, -0.01, 0.6]
+
+
+@pytest.fixture
+def views() -> Shard:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.5, 1.0]).as_matrix()
+    pose[:3, 3] = [0.05, 0.02, 0.04]
+    local = box_corners(np.array([[-0.02, -0.03, -0.05], [0.04, 0.01, 0.02]]))
+    world = local @ pose[:3, :3].T + pose[:3, 3]
+    corners = world @ CAMERA[:3, :3].T + CAMERA[:3, 3]
+    arrays = {
+        "camera/intrinsics": K[None],
+        "camera/extrinsics": CAMERA[None],
+        "camera/scene_index": np.zeros(1, np.int32),
+        "camera/eye": np.zeros(1, np.uint8),
+        "camera/stereo_baseline_m": np.zeros(1),
+        "image/rgb": np.zeros((1, H, W, 3), np.uint8),
+        "image/depth": np.ones((1, H, W), np.float32),
+        "image/segmentation": np.full((1, H, W), 2, np.uint8),
+        "box/bounding_box_2d_tight": np.array([[3, 4, 20, 15]], np.float32),
+        "box/bounding_box_2d_loose": np.array([[2.6, 4, 21, 15]], np.float32),
+        "box/bounding_box_3d": corners[None].astype(np.float32),
+        "box/occlusion_ratio": np.array([0.25], np.float32),
+    }
+    return Shard("views", {"object": "mug"}, arrays)
+
+
+def test_replicators_layout_has_the_boxes_and_matrices_of_ours(views: Shard, tmp_path) -> None:
+    replicator.write(views, tmp_path)
+    (row,) = np.load(tmp_path / "bounding_box_3d_0000.npy")
+    local = box_corners(np.array([[row[f"{axis}_{end}"] for axis in "xyz"] for end in ("min", "max")], float))
+    world = np.concatenate([local, np.ones((8, 1))], axis=1) @ row["transform"].astype(float)  # row vectors
+    corners = world[:, :3] @ CAMERA[:3, :3].T + CAMERA[:3, 3]
+    np.testing.assert_allclose(corners, views["box/bounding_box_3d"][0], atol=1e-6)  # float32 of the file
+    said = json.loads((tmp_path / "camera_params_0000.json").read_text())
+    view, projection = (np.reshape(said[f"camera{name}"], (4, 4)) for name in ("ViewTransform", "Projection"))
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3))
+    clip = np.concatenate([points, np.ones((20, 1))], axis=1) @ view @ projection  # row vectors, as USD has them
+    ndc = clip[:, :2] / clip[:, 3:]
+    pixels = np.stack([(ndc[:, 0] + 1) / 2 * W, (1 - ndc[:, 1]) / 2 * H], axis=1)
+    in_camera = (points @ CAMERA[:3, :3].T + CAMERA[:3, 3]) @ K.T
+    np.testing.assert_allclose(pixels, in_camera[:, :2] / in_camera[:, 2:], atol=1e-9)
+    (box,) = np.load(tmp_path / "bounding_box_2d_tight_0000.npy")
+    assert [int(box[name]) for name in ("x_min", "y_min", "x_max", "y_max")] == [3, 4, 20, 15]
+    assert float(box["occlusionRatio"]) == 0.25
+    assert json.loads((tmp_path / "bounding_box_2d_tight_labels_0000.json").read_text()) == {"0": {"class": "mug"}}
+    views.arrays["box/bounding_box_2d_tight"] = np.full((1, 4), np.nan, np.float32)
+    replicator.write(views, tmp_path / "unseen")
+    assert len(np.load(tmp_path / "unseen" / "bounding_box_2d_tight_0000.npy")) == 0
 
 
 def test_every_picture_is_one_sample_with_its_grasps(tmp_path) -> None:
