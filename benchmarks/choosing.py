@@ -50,7 +50,6 @@ AVOIDED = {"025_mug": "z > 0.05", "006_mustard_bottle": "z > 0.1", "035_power_dr
 CONES = ("0, 0, -1, 30", "1, 0, 0, 30")
 #: Least mean distance of corresponding hand points of two distinct grasps [m].
 DISTINCT_M = 0.02
-DISTINCT = (128, 256, 512, 1024)
 
 
 class Cell:
@@ -152,18 +151,17 @@ def cones(given: argparse.Namespace) -> Iterator[str]:
 
 
 def distinct(given: argparse.Namespace) -> Iterator[str]:
+    numbers = [given.candidates // 4, given.candidates // 2, given.candidates]
     yield head(
         "Distinct valid grasps",
         "Two grasps are distinct if corresponding points of the hand are 2 cm apart on average, or if other digits "
-        "touch. Median over the objects.",
-        *("hand", *(f"{count} candidates" for count in DISTINCT)),
+        "touch.",
+        *("object", "hand", *(f"{number} candidates" for number in numbers)),
     )
-    for hand in ("allegro", "shadow"):
-        counts = []
-        for name in given.objects or objects(given):
-            cell = Cell(given, hand, name, max(DISTINCT))
-            counts.append([count_distinct(cell, first) for first in DISTINCT])
-        yield f"| {hand} | " + " | ".join(f"{value:.0f}" for value in np.median(counts, axis=0)) + " |"
+    for name in given.objects or objects(given):
+        for hand in ("allegro", "shadow"):
+            cell = Cell(given, hand, name, given.candidates)
+            yield f"| {name} | {hand} | " + " | ".join(str(count_distinct(cell, first)) for first in numbers) + " |"
 
 
 def count_distinct(cell: Cell, first: int) -> int:
@@ -232,6 +230,7 @@ def main() -> None:
     parser.add_argument("--types", nargs="+", choices=list(TAXONOMY), help="types of part taxonomy; default: all")
     parser.add_argument("--grasps", type=int, default=16)
     parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--candidates", type=int, default=1024, help="candidates of the part distinct")
     parser.add_argument("--page", type=Path, help="file for the tables in Markdown")
     given = parser.parse_args()
     lines = [
