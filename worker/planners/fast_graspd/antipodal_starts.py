@@ -21,7 +21,6 @@ from typing import Any, Final
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from graspd.service.model.transforms import (
     IDENTITY_POSE,
@@ -500,6 +499,8 @@ def _pads(hand: HandModel, known: PinchPostures) -> Floats:
 def _is_within_reach(obj: ObjectModel, middle: Floats, back: Floats, longest: float) -> NDArray[np.bool_]:
     """Return a mask (P,) of pairs with less of the object than `longest` [m] in the direction `back` (3,), behind them.
     `middle` (P, 3) is relative to the centre of mass [m]. All pairs, if there is none."""
+    from scipy.spatial.distance import cdist  # only cones need it
+
     surface = region_points(obj, WHOLE)[0] - obj.centre_of_mass
     above = surface @ back - (middle @ back)[:, None]
     beside = cdist(middle - np.outer(middle @ back, back), surface - np.outer(surface @ back, back)) < PALM_M
