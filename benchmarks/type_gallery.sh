@@ -29,6 +29,8 @@ picture power_sphere 056_tennis_ball
 picture precision_disk 056_tennis_ball
 picture precision_sphere 056_tennis_ball
 picture tripod 056_tennis_ball
+picture fixed_hook 048_hammer
+picture distal 006_mustard_bottle
 picture lateral 037_scissors
 picture sphere_4_finger 056_tennis_ball
 picture quadpod 056_tennis_ball

@@ -30,11 +30,13 @@ class JobKeywords(TypedDict, total=False):
         "ring",
         "sphere_3_finger",
         "sphere_4_finger",
+        "distal",
         "small_diameter",
         "medium_wrap",
         "large_diameter",
         "power_disk",
         "power_sphere",
+        "fixed_hook",
         "lateral",
     ]
     mass: float | None
@@ -90,11 +92,13 @@ class SynthesizeKeywords(TypedDict, total=False):
         "ring",
         "sphere_3_finger",
         "sphere_4_finger",
+        "distal",
         "small_diameter",
         "medium_wrap",
         "large_diameter",
         "power_disk",
         "power_sphere",
+        "fixed_hook",
         "lateral",
     ]
     mass: float | None

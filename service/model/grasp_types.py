@@ -23,11 +23,13 @@ GraspTypeName = Literal[
     "ring",
     "sphere_3_finger",
     "sphere_4_finger",
+    "distal",
     "small_diameter",
     "medium_wrap",
     "large_diameter",
     "power_disk",
     "power_sphere",
+    "fixed_hook",
     "lateral",
 ]
 BALANCED: Final[tuple[GraspTypeName, ...]] = ("power", "precision", "pinch")
@@ -45,7 +47,9 @@ TAXONOMY: Final[dict[str, int]] = {
     "precision_disk": 12,
     "precision_sphere": 13,
     "tripod": 14,
+    "fixed_hook": 15,
     "lateral": 16,
+    "distal": 19,
     "sphere_4_finger": 26,
     "quadpod": 27,
     "sphere_3_finger": 28,

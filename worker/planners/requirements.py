@@ -80,7 +80,7 @@ class Requirements:
             kind = kinds[batch % len(kinds)]
         rule, digits = RULES.get(kind), tuple[str, ...](request.digits)
         if rule is not None and rule.digits and not digits:
-            digits = NAMES[: rule.digits]
+            digits = NAMES[not rule.thumb :][: rule.digits]
         texts = (request.touch_region, request.avoid_region)
         regions = [_region(text, obj, np.asarray(origin)) if text else None for text in texts]
         found = cls(kind, digits, ContactRegion(*regions) if any(texts) else WHOLE)
@@ -122,14 +122,14 @@ class Requirements:
         It has too few digits or does not reach the object, or the object has no surface in the region. Raises
         HandError: the digits do not oppose."""
         rule, names = self.rule, digit_names(hand)
-        if rule is not None and rule.digits > len(names):
-            count = f"has {len(names)}" if names else "is a gripper"
-            raise InputError(
-                f"type {self.type} needs {rule.digits} digits, and {hand.name} {count}: choose power or precision"
-            )
-        if rule is not None and rule.digits and ("thumb" not in self.digits or rule.digits > len(self.digits)):
-            given = ", ".join(self.digits)
-            raise InputError(f"type {self.type} needs {rule.digits} digits with the thumb; digits name {given}")
+        if rule is not None and rule.digits:
+            fingers = rule.digits - rule.thumb
+            needed = f"{rule.digits} digits {'with' if rule.thumb else 'besides'} the thumb"
+            if fingers >= len(names):
+                count = f"has {len(names)}" if names else "is a gripper"
+                raise InputError(f"type {self.type} needs {needed}, and {hand.name} {count}: choose power or precision")
+            if len(set(self.digits) - {"thumb"}) < fingers or (rule.thumb and "thumb" not in self.digits):
+                raise InputError(f"type {self.type} needs {needed}; digits name {', '.join(self.digits)}")
         require_opposing(self.hand(hand))
         if self.like is not None:
             away = float(np.linalg.norm(self.like[:3] - obj.centre_of_mass)) - obj.radius

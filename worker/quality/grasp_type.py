@@ -13,8 +13,11 @@ digit touches *by a side* if most of its surface within 2 mm of the object faces
 tolerance is 45 degrees. A jaw has no side, so a gripper's grasps are of type precision, or power where its palm
 touches.
 
-The taxonomy describes its types in words. `RULES` states them by contacts: opposition, touching digits, arrangement of
-the fingers, and width. Fingers are *in line* if the object's normals at their contacts are nearly parallel."""
+The taxonomy describes its types in words, by opposition, virtual fingers and position of the thumb. `RULES` states them
+by contacts: opposition, touching digits, arrangement of the fingers, and width. Fingers are *in line* if the object's
+normals at their contacts are nearly parallel. The fingers of a distal grasp touch below the pads without the palm
+(MacKenzie and Iberall, The Grasping Hand, 1994, app. B). Those of a fixed hook hold the object against the palm without
+the thumb; all four wrap, unlike those of the flat palmar grasp (30)."""
 
 from __future__ import annotations
 
@@ -122,10 +125,6 @@ class ContactPattern:
         mean = (self.place[:, 1:] * others).sum(axis=1) / np.maximum(others.sum(axis=1), 1)
         return np.asarray(np.linalg.norm(mean - self.place[:, 0], axis=-1))
 
-    def count(self) -> NDArray[np.int32]:
-        """Return the number (B,) of touching digits if the thumb is among them, else 0."""
-        return np.where(self.touches[:, 0], self.touches.sum(axis=1), 0).astype(np.int32)
-
     def taxonomy(self) -> NDArray[np.int32]:
         """Return the number (B,) of the first taxonomy type whose rule applies; 0 if none does."""
         out = np.zeros(len(self.palm), np.int32)
@@ -141,12 +140,16 @@ class Rule:
 
     kind: GraspType
     digits: int = 0
-    """Number of touching digits, thumb included; 0: any number."""
+    """Number of touching digits; 0: any number."""
+    thumb: bool = True
+    """Whether the thumb touches, if the rule states digits or the palm."""
     palm: bool | None = None
     """Whether the palm touches; None: either."""
     arrangement: Literal["any", "line", "round", "disk", "sphere"] = "any"
     width: tuple[float, float] = (0.0, np.inf)
     """Range of `ContactPattern.width` [m]."""
+    by_fingers: bool = False
+    """Whether each finger must touch with more than its last link."""
     to_side: bool = False
     """Whether the thumb presses with its pad against a side of the other digit."""
 
@@ -154,9 +157,11 @@ class Rule:
         """Return a mask (B,) of the grasps of this type."""
         out = seen.types == self.kind
         if self.digits:
-            out = out & (seen.count() == self.digits)
+            out = out & (seen.touches.sum(axis=1) == self.digits)
         if self.palm is not None:
             out = out & (seen.palm == self.palm)
+        if self.digits or self.palm:
+            out = out & (seen.touches[:, 0] == self.thumb)
         if self.arrangement == "line":
             out = out & seen.in_line
         elif self.arrangement != "any":
@@ -165,6 +170,8 @@ class Rule:
                 out = out & (seen.flat == (self.arrangement == "disk"))
         if self.width != (0.0, np.inf):
             out = out & (seen.width >= self.width[0]) & (seen.width < self.width[1])
+        if self.by_fingers:
+            out = out & (seen.wraps | ~seen.touches)[:, 1:].all(axis=1)
         return out & ~seen.by_side[:, 0] if self.to_side else out
 
 
@@ -185,11 +192,13 @@ RULES: Final = {
     "ring": Rule(_POWER, 2, palm=False),
     "sphere_3_finger": Rule(_POWER, 3, palm=False),
     "sphere_4_finger": Rule(_POWER, 4, palm=False),
+    "distal": Rule(_POWER, 5, palm=False, by_fingers=True),
     "small_diameter": Rule(_POWER, palm=True, arrangement="line", width=(0.0, MEDIUM_M[0])),
     "medium_wrap": Rule(_POWER, palm=True, arrangement="line", width=MEDIUM_M),
-    "large_diameter": Rule(_POWER, palm=True, arrangement="line", width=(MEDIUM_M[1], np.inf)),
+    "large_diameter": Rule(_POWER, 5, palm=True, arrangement="line", width=(MEDIUM_M[1], np.inf)),
     "power_disk": Rule(_POWER, palm=True, arrangement="disk"),
     "power_sphere": Rule(_POWER, palm=True, arrangement="sphere"),
+    "fixed_hook": Rule(_POWER, 4, thumb=False, palm=True, by_fingers=True),
     "lateral": Rule(_LATERAL, 2, palm=False, to_side=True),
 }
 

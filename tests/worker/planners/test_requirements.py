@@ -33,7 +33,7 @@ from graspd.worker.files.provenance import object_of_shard
 from graspd.worker.files.synthesis import synthesize_grasps
 from graspd.worker.generation import validated_grasps
 from graspd.worker.grasps import GraspSet
-from graspd.worker.hands.digits import hand_with_digits
+from graspd.worker.hands.digits import Part, digit_names, finger_of_body, hand_with_digits
 from graspd.worker.hands.jaws import fingertip_pad
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
@@ -221,6 +221,14 @@ def test_unused_digits_stay_locked_and_do_not_touch(options: dict[str, object]) 
     assert not (columns["quality/digits"] & ~0b11).any() and (planned("ball")[2]["quality/digits"] & ~0b11).any()
 
 
+def test_a_fixed_hook_has_contacts_of_palm_and_four_fingers_without_the_thumb() -> None:
+    shadow = hand_from_path("shadow")
+    wanted = required(hand=shadow, type="fixed_hook")
+    allowed, thumb = wanted.allowed(shadow).parts, digit_names(shadow).index("thumb")
+    assert wanted.digits == ("index", "middle", "ring", "little") and wanted.links == 4
+    assert ((allowed == Part.NONE) == (finger_of_body(shadow) == thumb)).all()
+
+
 @pytest.mark.parametrize(("place", "cone"), [("free", SIDE), ("free", ABOVE), ("table", ABOVE)])
 def test_planned_grasps_approach_within_the_cone(place: str, cone: str) -> None:
     wanted, _, columns = planned("bar", place, approach_cone=cone)
@@ -268,9 +276,11 @@ def test_without_requirements_nothing_is_rejected_for_them() -> None:
 @pytest.mark.parametrize(
     ("hand", "options", "message"),
     [
-        ("gripper", {"type": "pinch"}, "needs 2 digits, and .* is a gripper: choose power or precision"),
+        ("gripper", {"type": "pinch"}, "needs 2 digits with the thumb, and .* is a gripper: choose power or precision"),
         ("gripper", {"digits": ("thumb", "index")}, "no digits to choose"),
-        ("barrett", {"type": "quadpod"}, "needs 4 digits, and barrett has 3"),
+        ("barrett", {"type": "quadpod"}, "needs 4 digits with the thumb, and barrett has 3"),
+        ("allegro", {"type": "fixed_hook"}, "needs 4 digits besides the thumb, and allegro has 4"),
+        ("shadow", {"type": "fixed_hook", "digits": ("thumb", "index", "middle", "ring")}, "needs 4 digits besides"),
         ("allegro", {"digits": ("thumb", "little")}, "no little"),
         ("allegro", {"type": "tripod", "digits": ("thumb", "index")}, "needs 3 digits with the thumb"),
         ("allegro", {"type": "pinch", "digits": ("index", "middle")}, "needs 2 digits with the thumb"),

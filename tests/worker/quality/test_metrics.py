@@ -365,7 +365,7 @@ def test_cell_of_approach_is_that_of_where_the_palm_comes_from() -> None:
 def pattern(normals: list[tuple[float, float, float]], width: float = 0.05, **how: object) -> ContactPattern:
     """Contacts of a thumb and fingers at `normals` on a solid `width` wide; a digit without a normal is clear."""
     normal = np.zeros((1, 5, 3))
-    normal[0, : len(normals)] = np.array(normals) / np.linalg.norm(normals, axis=1, keepdims=True)
+    normal[0, : len(normals)] = np.array(normals) / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     wraps, by_side = (np.isin(np.arange(5), how.get(name, ()))[None] for name in ("wraps", "by_side"))
     touches, palm = np.linalg.norm(normal, axis=-1) > 0, np.array([bool(how.get("palm"))])
     return ContactPattern(palm, touches, wraps, by_side, 0.5 * width * normal, normal)
@@ -394,11 +394,13 @@ CASES = {
     "ring": pattern(around(0, 180), wraps=(0, 1)),
     "sphere_3_finger": pattern(around(0, 120, 240), wraps=(1, 2)),
     "sphere_4_finger": pattern(around(0, 90, 180, 270), wraps=(1, 2)),
+    "distal": pattern(around(*FIVE), wraps=range(1, 5)),
     "small_diameter": pattern(plate(4), 0.02, palm=True),
     "medium_wrap": pattern(plate(4), 0.04, palm=True),
     "large_diameter": pattern(plate(4), 0.08, palm=True),
     "power_disk": pattern(around(*FIVE), palm=True),
     "power_sphere": pattern(around(*FIVE, lift=1.0), palm=True),
+    "fixed_hook": pattern([(0, 0, 0.0), *plate(4)[1:]], palm=True, wraps=range(1, 5)),
     "lateral": pattern(plate(1), by_side=(1,)),
 }
 
@@ -414,9 +416,34 @@ def test_a_pattern_has_its_type_of_the_taxonomy_and_no_other(name: str) -> None:
 
 def test_numbers_are_those_of_the_published_taxonomy() -> None:
     """Feix et al. 2016: 33 types, of which some have no rule by contacts."""
-    numbers = {"medium_wrap": 3, "palmar_pinch": 9, "tripod": 14, "lateral": 16, "quadpod": 27, "ring": 31}
+    numbers = {
+        "medium_wrap": 3,
+        "palmar_pinch": 9,
+        "tripod": 14,
+        "fixed_hook": 15,
+        "lateral": 16,
+        "distal": 19,
+        "quadpod": 27,
+        "ring": 31,
+    }
     assert numbers.items() <= TAXONOMY.items() and len(set(TAXONOMY.values())) == len(TAXONOMY)
     assert set(TAXONOMY) == set(RULES) - {"power", "precision", "pinch"}
+
+
+def test_palm_grasps_need_the_fingers_of_their_type() -> None:
+    """Feix et al. 2016: the palm opposes fingers 2 to 5 in a large diameter grasp, a fixed hook and a distal grasp."""
+    few = {
+        "large_diameter": pattern([*plate(3), (0, 0, 0.0)], 0.08, palm=True),
+        "fixed_hook": pattern([(0, 0, 0.0), *plate(3)[1:]], palm=True, wraps=range(1, 4)),
+        "distal": pattern(around(*FIVE[:4]), wraps=range(1, 4)),
+    }
+    assert not any(RULES[name].applies(seen)[0] for name, seen in few.items())
+    for name in ("fixed_hook", "distal"):
+        by_pad = replace(CASES[name], wraps=np.arange(5)[None] % 4 > 0)
+        assert not RULES[name].applies(by_pad)[0], "the little finger touches with its last link only"
+    for name in ("small_diameter", "medium_wrap", "power_disk", "power_sphere"):
+        without_thumb = replace(CASES[name], touches=np.arange(5)[None] > 0)
+        assert not RULES[name].applies(without_thumb)[0]
 
 
 @pytest.mark.parametrize(
