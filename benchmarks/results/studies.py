@@ -645,7 +645,8 @@ STUDIES: Final = (
         (
             "graspd demo --out WORK/demo",
             "cp WORK/demo/grasps.png OUT/images/demo-grasps.png",
-            "cp WORK/demo/views.png OUT/images/demo-views.png",
+            "python -c \"from PIL import Image; Image.open('WORK/demo/views.png')"
+            ".save('OUT/images/demo-views.webp', quality=90, method=6)\"",
         ),
         (
             "graspd demo --out WORK/demo --hand barrett --object block -n 4 --scenes 1 --views 1 --fidelity draft",
