@@ -641,7 +641,7 @@ STUDIES: Final = (
     Study(
         "demo",
         "pictures in the README",
-        ("images/demo-*.png",),
+        ("images/demo-*",),
         (
             "graspd demo --out WORK/demo",
             "cp WORK/demo/grasps.png OUT/images/demo-grasps.png",
