@@ -645,8 +645,7 @@ STUDIES: Final = (
         (
             "graspd demo --out WORK/demo",
             "cp WORK/demo/grasps.png OUT/images/demo-grasps.png",
-            "python -c \"from PIL import Image; Image.open('WORK/demo/views.png')"
-            ".save('OUT/images/demo-views.webp', quality=90, method=6)\"",
+            "python -m benchmarks.webp WORK/demo/views.png OUT/images/demo-views.webp",
         ),
         (
             "graspd demo --out WORK/demo --hand barrett --object block -n 4 --scenes 1 --views 1 --fidelity draft",
