@@ -1,4 +1,4 @@
-"""Sets of objects from a folder or ZIP of meshes or descriptions; the layouts of YCB and EGAD are detected."""
+"""Sets of objects from a folder or ZIP of meshes or descriptions, also laid out as YCB or EGAD."""
 
 from __future__ import annotations
 

@@ -232,7 +232,7 @@ def _stated(value: float) -> float:
 
 
 def _free_axes(joint: Mapping[str, Any]) -> list[tuple[str, tuple[float, float]]]:
-    """Return the free axes of a joint with limits [degrees or stage units]; an axis with low > high is locked."""
+    """Return the free axes of a joint with limits [degrees or stage units]; low > high locks an axis."""
     limits = float(joint.get("lowerLimit", -math.inf)), float(joint.get("upperLimit", math.inf))
     match joint["kind"]:
         case "Fixed":

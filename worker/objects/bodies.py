@@ -1,4 +1,4 @@
-"""One rigid body from a URDF, SDF or MJCF: shapes in the frame of its root link or model, and its mass and friction.
+"""One rigid body from a URDF, SDF or MJCF: shapes in the frame of its root, mass and friction.
 
 A description and its meshes are one ZIP of files of an upload. MuJoCo reads a sanitised MJCF: see
 `worker.objects.mjcf_source`."""
@@ -56,7 +56,7 @@ def pack_body(files: Mapping[str, bytes]) -> bytes:
 
 
 def read_body(main: str, packed: bytes) -> list[Soup]:
-    """Read the visible shapes of the body `main` as one mesh, and the collision shapes as another; one may be missing.
+    """Read the visible shapes of a body as one mesh, its collision shapes as another; one may be missing.
     Raises MeshError: no single rigid body, a value that no body can have, or a mesh that is missing or unreadable.
     LimitError: too large."""
     files = unpack(packed, limit_bytes=UNPACKED_LIMIT_BYTES)
@@ -130,7 +130,7 @@ def _moments(inertia: Element | None) -> Floats:
 
 
 def _inertial(mass: float, place: Floats, inertia: Floats) -> _Inertial:
-    """Return the mass, and the centre and inertia of a frame at the 4x4 matrix `place`, in the frame of the body."""
+    """Return mass, centre and inertia in the frame of the body, of a frame at the matrix `place`."""
     turn = place[:3, :3]
     return mass, place[:3, 3], turn @ inertia @ turn.T
 

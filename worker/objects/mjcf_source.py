@@ -37,7 +37,7 @@ _MESHES: Final = (".stl", ".obj", ".msh")
 
 
 def compile_model(files: Mapping[str, bytes], main: str) -> tuple[Any, str, list[str]]:
-    """Return MuJoCo's model, its text, and notes for the user; HandError if MuJoCo rejects it; see `inline_model`."""
+    """Return MuJoCo's model, its text, and notes for the user (`inline_model`); HandError if rejected."""
     import mujoco  # slow to load
 
     text, assets, notes = inline_model(files, main)

@@ -1,4 +1,4 @@
-"""OpenUSD stages (extra `usd`): geometry and physics of all prims below the default prim, read in a child process.
+"""OpenUSD stages (extra `usd`): geometry and physics below the default prim, read in a child process.
 
 The frame of an object is that of its stage: axes as authored (`upAxis` is not applied), numbers in metres by
 `metersPerUnit`. Subdivision surfaces are read as their control cage."""
@@ -104,7 +104,7 @@ def _matter(stage: Stage) -> dict[str, float]:
 
 
 def read_stage(files: Mapping[str, bytes], main: str, error: type[InputError]) -> Stage:
-    """Read a stage from its layers, or from a package (USDZ), in a child process with limits of time and memory.
+    """Read a stage from its layers or a package (USDZ), in a child process of limited time and memory.
     Raises `error`: the stage is unreadable, too large, cyclic, or refers to files outside; or usd-core is missing."""
     import_usd(error)
     try:

@@ -1,4 +1,4 @@
-"""Drake on the CPU (Tedrake et al. 2019): contact as a convex problem with lagged friction (Castro et al. 2023)."""
+"""Drake on the CPU (Tedrake et al. 2019): convex contact with lagged friction (Castro et al. 2023)."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ class DrakeSimulation:
         return joint
 
     def _add_shape(self, body: Any, surface: Any, shape: Any, pose: Any = _ORIGIN) -> None:
-        """Add a shape; two shapes touch over an area if both surfaces are hydroelastic and one of them is soft."""
+        """Add a shape; two shapes touch over an area if both are hydroelastic and one of them is soft."""
         name = f"shape{self._plant.num_collision_geometries()}"
         self._plant.RegisterCollisionGeometry(body, pose, shape, name, surface)
 

@@ -1,4 +1,4 @@
-"""PhysX 5 on the CPU, through SAPIEN (Xiang et al. 2020). The hand is an articulation in reduced coordinates."""
+"""PhysX 5 on the CPU, through SAPIEN (Xiang et al. 2020); the hand has reduced coordinates."""
 
 from __future__ import annotations
 

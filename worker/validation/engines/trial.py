@@ -27,7 +27,7 @@ _COUNT: Final = round(protocol.HOLD_S / protocol.INTERVAL_S)
 
 
 def engine_model(scene: Scene, pieces: ConvexPieces, supports: PlacedGrasps | None = None) -> port.EngineModel:
-    """Return the engine-neutral model with all numbers of MuJoCo's compiled model: the same for all engines."""
+    """Return the model for all engines, with all numbers of MuJoCo's compiled model."""
     model, hand = scene.model, scene.hand
     at = scene.object_body
     friction = model.geom_friction[model.body_geomadr[at]]
@@ -153,7 +153,7 @@ def _rest(closed: port.Motion, raised: Floats, seconds: Floats, force: Floats) -
 def run_trial(
     simulation: port.Simulation, trial: port.Trial, centre: Floats, *, early: bool = True
 ) -> protocol.Rollout:
-    """Simulate one trial up to its first loss; `centre` (3,) is the object's centre of mass in its own frame.
+    """Simulate one trial up to its first loss; `centre` (3,) is the object's centre of mass.
     With `early`, a test ends as soon as motion at `AHEAD` times the present rate would stay inside the limits."""
     rollout = protocol.Rollout([protocol.Outcome.NOT_TRIED] * len(trial.tests))
     checks = _Checks(simulation, trial, centre, rollout, early)
