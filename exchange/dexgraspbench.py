@@ -3,8 +3,6 @@
 docs/how-to/exchange/dexgraspbench.md describes files and fields. `..._qpos` have root and joint order of the model that
 a benchmark's configuration names; `HandMapping` relates both to graspd's hand."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@ Feature: https://nvidia.github.io/simready-foundation/latest/features/FET_005_ST
 a line (`BasisCurves`) below the default prim, named `grasp_identifier...`, along which opposing fingers close; PMT.001
 is a physics material on each collider. Hand frames, joint positions and provenance are below `graspd`."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Sequence

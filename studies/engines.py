@@ -1,7 +1,5 @@
 """Agreement of engines on the same grasps: success, Cohen's κ, kinds of losses, price of a verdict."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,8 +1,6 @@
 """Viewer: a viser server that shows the grasps of one file, with a slider over the trajectory.
 Hand, object and scene are nodes. Lengths are in metres; poses are x y z, then quaternion w x y z."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import socket

@@ -1,7 +1,5 @@
 """Grasps: search by metrics, distributions of a job, and details of one grasp from its base shard."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from functools import lru_cache

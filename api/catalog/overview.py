@@ -1,7 +1,5 @@
 """Overview of the service: workers, queue, statistics, health, usage of projects, and deletions."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io

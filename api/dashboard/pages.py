@@ -1,7 +1,5 @@
 """Pages of the service: home, workers, charts, failure maps, usage, deletions, problem types, session."""
 
-from __future__ import annotations
-
 import time
 from collections import defaultdict
 from collections.abc import AsyncIterable

@@ -1,7 +1,5 @@
 """`/v1/grasps`: index of all grasps; `/v1/tags`: names that users give to grasps."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response

@@ -2,8 +2,6 @@
 
 The planner returns all hands; `info["passed"]` marks those that the published code would accept."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Condition of an index database, read without changes: `Database` would make or alter its tables."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Rebuild of the index from the store, and differences between an index and the store."""
 
-from __future__ import annotations
-
 import logging
 import tempfile
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Mass and friction of objects: bounds and defaults."""
 
-from __future__ import annotations
-
 from typing import Annotated, Final
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """Rigid transforms in NumPy, with broadcasting. Pose (7,): position x y z, unit quaternion w x y z."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -6,8 +6,6 @@ stored objects below `removed/` and deletes that record. After the grace time it
 that no job needs. It can resume after a kill.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import time

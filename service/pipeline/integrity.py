@@ -3,8 +3,6 @@
 The check changes nothing. The scan has a limited rate and can resume. A repair makes damaged shards again.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import heapq

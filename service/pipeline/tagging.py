@@ -1,7 +1,5 @@
 """Changes of tags: each writes the record, then the rows, within one write transaction of the index."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 
 from graspd.service.model import names

@@ -1,7 +1,5 @@
 """Commands `graspd up`, `graspd controller` and `graspd admin index`."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

@@ -1,7 +1,5 @@
 """URDF, SDF or MJCF of an object: the description among its files, and the files that it names."""
 
-from __future__ import annotations
-
 import posixpath
 from collections.abc import Mapping
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Files of a hand on the user's disk: selection, main file and format."""
 
-from __future__ import annotations
-
 import json
 import posixpath
 import re

@@ -1,7 +1,5 @@
 """Sets of objects from a folder or ZIP of meshes or descriptions, also laid out as YCB or EGAD."""
 
-from __future__ import annotations
-
 import posixpath
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Files of a USD stage: the root layer and all layers that it composes, inside one folder."""
 
-from __future__ import annotations
-
 import posixpath
 from pathlib import Path
 from typing import Any, Final

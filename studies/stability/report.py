@@ -1,7 +1,5 @@
 """Failure maps as JSON, Markdown and plots."""
 
-from __future__ import annotations
-
 import json
 import math
 import textwrap

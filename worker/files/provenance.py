@@ -2,8 +2,6 @@
 
 Files are identified by digest, so a modified or different file is never used instead."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

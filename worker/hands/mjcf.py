@@ -3,8 +3,6 @@
 Bodies become links. Several joints of a body become a chain of joints with links between them. Elements that a hand
 does not need, and files outside the upload, never reach MuJoCo: see `worker.objects.mjcf_source`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

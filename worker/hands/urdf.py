@@ -3,8 +3,6 @@
 The common URDF libraries accept reversed limits, NaN, unknown mimics and several roots; this reader refuses them with a
 message. Those libraries also resolve mimic chains wrongly."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Final

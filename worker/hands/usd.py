@@ -3,8 +3,6 @@
 Schema: https://openusd.org/release/api/usd_physics_page_front.html. Limits in degrees and drives per degree are
 converted to SI units. A link's frame is its body's, without scale."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping

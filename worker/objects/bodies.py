@@ -3,8 +3,6 @@
 A description and its meshes are one ZIP of files of an upload. MuJoCo reads a sanitised MJCF: see
 `worker.objects.mjcf_source`."""
 
-from __future__ import annotations
-
 import math
 import posixpath
 import re

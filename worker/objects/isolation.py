@@ -1,7 +1,5 @@
 """Child process of a reader of untrusted files, with the environment that it needs and no credentials."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -3,8 +3,6 @@
 MuJoCo reads any file on disk that a model names. This module therefore inserts includes, renames meshes of the hand's
 files, and removes all parts that a hand does not need. Only the elements listed here reach MuJoCo."""
 
-from __future__ import annotations
-
 import math
 import posixpath
 import xml.etree.ElementTree as ElementTree

@@ -1,7 +1,5 @@
 """Preparation of objects, cached by content: reading, repair, simplification, normals, hull and mass."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

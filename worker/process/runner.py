@@ -1,7 +1,5 @@
 """Run a task's stage and convert its result or error to an outcome."""
 
-from __future__ import annotations
-
 import errno
 import logging
 import os

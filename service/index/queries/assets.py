@@ -1,7 +1,5 @@
 """Queries of hands and objects, and of named sets of objects."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 from sqlalchemy import ColumnElement, Connection, and_, case, or_, select

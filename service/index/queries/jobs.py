@@ -1,7 +1,5 @@
 """Queries of jobs, tasks, attempts and shards, and the outcomes of a job's candidates."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final, Literal

@@ -4,8 +4,6 @@ The index knows which cells have a job, and a job's event names the dataset even
 can therefore continue without applying an event twice.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Iterable

@@ -1,7 +1,5 @@
 """Checks of Redis, index and store: availability, writing and persistence."""
 
-from __future__ import annotations
-
 import secrets
 import time
 from collections.abc import Mapping

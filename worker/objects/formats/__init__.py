@@ -1,7 +1,5 @@
 """Mesh files from bytes: STL, OBJ, PLY, OFF, GLB, DAE, USD. No header of the input is trusted."""
 
-from __future__ import annotations
-
 import codecs
 import re
 import struct

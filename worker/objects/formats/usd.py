@@ -3,8 +3,6 @@
 The frame of an object is that of its stage: axes as authored (`upAxis` is not applied), numbers in metres by
 `metersPerUnit`. Subdivision surfaces are read as their control cage."""
 
-from __future__ import annotations
-
 import io
 import json
 import tempfile

@@ -3,8 +3,6 @@
 The standard output is an NPZ: `facts` (JSON) and arrays of meshes. Numbers are the file's, at the earliest time.
 Variants are those that the file selects. Matrices act on column vectors."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -6,8 +6,6 @@ Before the fine phase `obstruction` tests whether each hand can leave its grasp,
 on the lift. A hand hooked around an edge holds well but cannot reach its grasp. A hand close below a board
 cannot lift."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -4,8 +4,6 @@ The protocol (`worker.validation.engines.trial`) is written once, on top of this
 follows targets, applies one force, and returns the object's pose. No engine has gravity: the weight of the object is
 part of the force, and the hand has no weight."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol

@@ -2,8 +2,6 @@
 
 The module of an engine has its name and a constant `ENGINE`; MuJoCo is part of the validator."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ As in DexGraspBench, the hand closes, and each push of 2 s starts from the close
 smoothly and holds for 2 s. Except at level dexgraspbench, pushes and holds end early by the rule of level standard.
 Pregrasps that penetrate, and approaches that collide, are rejected by geometry alone, so equally for all engines."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Final
 
