@@ -52,6 +52,12 @@ def quat_from_axis_angle(axis: Floats, angle: Floats) -> Floats:
     return np.concatenate([np.cos(half), np.asarray(axis, float) * np.sin(half)], axis=-1)
 
 
+def quat_from_rpy(angles: Floats) -> Floats:
+    """Return the quaternion of roll, pitch and yaw (3,): rotations about the fixed axes x, then y, then z."""
+    x, y, z = quat_from_axis_angle(np.eye(3), angles)
+    return quat_multiply(z, quat_multiply(y, x))
+
+
 def slerp(a: Floats, b: Floats, share: float) -> Floats:
     """Interpolate unit quaternions (4,) from `a` (share 0) to `b` (share 1) along the shorter arc."""
     a, b = np.asarray(a, float), np.asarray(b, float)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError, MeshError
+from graspd.service.model.matter import MOST_FRICTION
 from graspd.service.model.transforms import Floats
 from graspd.service.store.assets import pack, unpack
 from graspd.service.store.usd_layers import SUFFIXES as SUFFIXES
@@ -29,8 +30,6 @@ from graspd.worker.objects.isolation import run_isolated
 MAGIC: Final = (b"#usda", b"PXR-USDC", b"PK\x03\x04")
 #: Largest size of all layers together [bytes].
 _MAX_BYTES: Final = 2**28
-#: Largest coefficient of friction of an object.
-_MOST_FRICTION: Final = 3.0
 Ints = NDArray[np.int64]
 
 
@@ -97,7 +96,7 @@ def _matter(stage: Stage) -> dict[str, float]:
     elif densities:
         found["density"] = densities[0] * stage.mass_unit / stage.unit**3
     if frictions := [shape["friction"] for shape in shapes if shape.get("friction", 0) > 0]:
-        found["friction"] = min(*frictions, _MOST_FRICTION)
+        found["friction"] = min(*frictions, MOST_FRICTION)
     return found
 
 
