@@ -49,7 +49,7 @@ screenshots: $(STAMP) ## take screenshots of the dashboard for docs/how-to/dashb
 	$(BIN)/python -m benchmarks.screenshots
 
 docs: $(STAMP) ## rewrite the generated tables of the docs
-	$(BIN)/python -m graspd.service.docs
+	$(BIN)/python -m docs.tables
 	$(BIN)/python -m benchmarks.results --pages
 
 docs-site: $(STAMP) ## build the documentation site in build/site; warnings are errors

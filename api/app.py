@@ -1,7 +1,5 @@
 """HTTP application. It keeps no state between requests that another process would need."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress

@@ -1,7 +1,5 @@
 """Format numbers, times, sizes and host names for pages and terminals."""
 
-from __future__ import annotations
-
 import ipaddress
 import shlex
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Errors as `application/problem+json` (RFC 9457): domain errors by slug, HTTP errors by status."""
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Callable
 from http import HTTPStatus

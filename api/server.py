@@ -4,8 +4,6 @@ uvicorn limits the time between requests, and `BodyLimit` the time between piece
 time for headers, and for the rest of a body after its response: each byte of this rest restarts uvicorn's limit.
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 import socket

@@ -1,7 +1,5 @@
 """`graspd api`: run the HTTP API and the dashboard until stopped."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

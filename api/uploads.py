@@ -1,7 +1,5 @@
 """Files of an asset from an upload: one file, or a ZIP of a folder (hands and objects only)."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -3,8 +3,6 @@
 Baselines use flat triangles of the object (no Phong smoothing). Pregrasp and squeeze come from the same code as in
 `fast_graspd`, and so do starts that a publication does not define."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 The model's world frame is the frame of graspd's root link, so `qpos` begins with this link's pose. Names of bodies are
 `root_<link>` and `f<number of the finger>_<link>`, because the evaluator finds fingers by prefix."""
 
-from __future__ import annotations
-
 import json
 import xml.etree.ElementTree as ElementTree
 from dataclasses import asdict, dataclass

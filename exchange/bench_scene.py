@@ -3,8 +3,6 @@
 Files of an object are its mesh, convex pieces, measurements, and scenes. In a scene the object floats at scale 1 or is
 on a table. Poses on a table are in the table's frame: z up, top at z = 0, where the evaluator has a floor."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath

@@ -3,8 +3,6 @@
 docs/how-to/exchange/dexgraspbench.md describes files and fields. `..._qpos` have root and joint order of the model that
 a benchmark's configuration names; `HandMapping` relates both to graspd's hand."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,20 +12,8 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
+from graspd.exchange import bench_scene
 from graspd.exchange.bench_hand import GRASPS, HandMapping, benchmark_mapping, body_names, load_mapping, write_hand
-from graspd.exchange.bench_scene import (
-    SCALE,
-    TABLETOP,
-    Row,
-    add_trajectory,
-    check_table,
-    object_of_scene,
-    save_record,
-    scenes_on_tables,
-    tabletop_fields,
-    write_object,
-    write_table,
-)
 from graspd.exchange.imported import ImportedGrasps, load_npy, scaled_object
 from graspd.exchange.plan import plain_name
 from graspd.service.model.errors import InputError
@@ -53,7 +39,7 @@ def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
     if len(mappings) > 1:
         names = ", ".join(sorted(one.config if one else "another" for one in mappings))
         raise InputError(f"{path} has grasps for {len(mappings)} models of a hand ({names}); give the folder of one")
-    sets: dict[tuple[float, bool], list[Row]] = defaultdict(list)
+    sets: dict[tuple[float, bool], list[bench_scene.Row]] = defaultdict(list)
     for file in files:
         for row in _load_rows(file):
             sets[_object_scale(row), _is_on_table(row)].append(row)
@@ -73,23 +59,25 @@ def write(
     Return the grasp files of the first experiment. The object is at the origin or, for `placed` grasps, on its table.
     Each of `write_models` gets an experiment. Raises InputError: the scenes are no tables."""
     if placed is not None:
-        check_table(placed)
+        bench_scene.check_table(placed)
     name = plain_name(obj.name)
-    obj_path, scene = write_object(obj, name, folder)
+    obj_path, scene = bench_scene.write_object(obj, name, folder)
     scenes = {0: (IDENTITY_POSE, scene)}
     number = np.zeros(len(grasps), np.intp)
     if placed is not None:
         number = placed.index
         poses = np.asarray(placed.object_pose, float)
-        scenes = {k: (poses[k], write_table(name, poses[k], k, folder)) for k in sorted(set(number[list(rows)]))}
+        scenes = {
+            k: (poses[k], bench_scene.write_table(name, poses[k], k, folder)) for k in sorted(set(number[list(rows)]))
+        }
     paths: list[Path] = []
     for mapping in write_models(hand, folder):
         out = folder / "output" / f"{experiment_name(placed)}_{mapping.config}"
         mapping.write(out)
-        written = [out / GRASPS / name / f"{SCALE}_pose{number[row]:03}" / f"{row}.npy" for row in rows]
+        written = [out / GRASPS / name / f"{bench_scene.SCALE}_pose{number[row]:03}" / f"{row}.npy" for row in rows]
         for row, file in zip(rows, written, strict=True):
             pose, path = scenes[number[row]]
-            record: Row = {
+            record: bench_scene.Row = {
                 "obj_path": obj_path.as_posix(),
                 "obj_scale": 1.0,
                 "obj_pose": pose.copy(),
@@ -97,8 +85,8 @@ def write(
             }
             record |= qpos_fields(mapping, hand, grasps, row, None if placed is None else pose)
             if placed is not None:
-                record |= tabletop_fields(mapping, hand, grasps, row, pose)
-            save_record(file, record)
+                record |= bench_scene.tabletop_fields(mapping, hand, grasps, row, pose)
+            bench_scene.save_record(file, record)
         paths = paths or written
     return paths
 
@@ -117,12 +105,14 @@ def write_models(hand: HandModel, folder: Path) -> list[HandMapping]:
 
 def experiment_name(placed: PlacedGrasps | None) -> str:
     """Return the name of the experiment of free grasps, or of grasps on tables."""
-    return NAME if placed is None else f"{NAME}_{TABLETOP}"
+    return NAME if placed is None else f"{NAME}_{bench_scene.TABLETOP}"
 
 
-def qpos_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats | None) -> Row:
+def qpos_fields(
+    mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats | None
+) -> bench_scene.Row:
     """Return the `..._qpos` of a grasp whose object is at the origin, or at `pose` (7,) on a table."""
-    record: Row = {}
+    record: bench_scene.Row = {}
     for name in POSTURES:
         found: Posture = getattr(grasps, name)
         root = found.hand_pose[row] if pose is None else compose(pose, found.hand_pose[row])
@@ -130,7 +120,7 @@ def qpos_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: in
     return record
 
 
-def _load_rows(file: Path) -> list[Row]:
+def _load_rows(file: Path) -> list[bench_scene.Row]:
     """Return the grasps of a file: one, or K if `..._qpos` are (K, 7 + J)."""
     found = load_npy(file)
     if not isinstance(found, dict):
@@ -139,7 +129,7 @@ def _load_rows(file: Path) -> list[Row]:
         raise InputError(f"{file} has no {missing[0]}")
     # A file without the object's pose names a scene that has it.
     if "obj_pose" not in found and "scene_path" in found:
-        found |= object_of_scene(file, str(found["scene_path"]))
+        found |= bench_scene.object_of_scene(file, str(found["scene_path"]))
     count = {len(found[f"{name}_qpos"]) if np.ndim(found[f"{name}_qpos"]) == 2 else 0 for name in POSTURES}
     rows = [found]
     if count != {0}:
@@ -158,16 +148,16 @@ def _value_of_grasp(value: Any, k: int, count: set[int]) -> Any:
     return value[k] if each else value
 
 
-def _object_scale(row: Row) -> float:
+def _object_scale(row: bench_scene.Row) -> float:
     return float(np.ravel(row.get("obj_scale", 1.0))[0])
 
 
-def _is_on_table(row: Row) -> bool:
-    return any(part.startswith(TABLETOP) for part in str(row.get("scene_path", "")).split("/"))
+def _is_on_table(row: bench_scene.Row) -> bool:
+    return any(part.startswith(bench_scene.TABLETOP) for part in str(row.get("scene_path", "")).split("/"))
 
 
 def _imported_grasps(
-    path: Path, hand: HandModel, obj: str, rows: list[Row], mapping: HandMapping | None
+    path: Path, hand: HandModel, obj: str, rows: list[bench_scene.Row], mapping: HandMapping | None
 ) -> ImportedGrasps:
     """Return grasps of one scale, all of a free object or all on tables."""
     scale = _object_scale(rows[0])
@@ -191,7 +181,7 @@ def _imported_grasps(
     grasps = GraspSet(grasp, pregrasp, squeeze, np.full(len(rows), np.nan))
     published = np.array([int(bool(row["succ_flag"])) if "succ_flag" in row else -1 for row in rows], np.int8)
     name = str(rows[0].get("obj_path", thing.name)).rstrip("/").rsplit("/", 1)[-1]
-    placed = scenes_on_tables(pose) if _is_on_table(rows[0]) else None
+    placed = bench_scene.scenes_on_tables(pose) if _is_on_table(rows[0]) else None
     if placed is not None:
-        grasps = replace(add_trajectory(hand, grasps, rows, pose, mapping), scene=placed.index)
+        grasps = replace(bench_scene.add_trajectory(hand, grasps, rows, pose, mapping), scene=placed.index)
     return ImportedGrasps(hand, thing, grasps, name, scale, published, placed)

@@ -4,8 +4,6 @@ DexLearn (Chen et al.) has the networks of BODex and Dexonomy. docs/how-to/excha
 poses and points share one frame: the table's or, for free grasps, the object's. Roots and joints are those of a hand
 model of DexGraspBench, see `bench_hand`."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence

@@ -4,8 +4,6 @@ Murali et al., GraspGen, ICRA 2026. docs/how-to/exchange/graspgen.md describes f
 of the gripper's base link in the frame of the object, whose mesh is multiplied by `scale`. Further fields, which
 GraspGen ignores, restore grasps of multi-fingered hands."""
 
-from __future__ import annotations
-
 import io
 import json
 import tarfile

@@ -2,8 +2,6 @@
 
 `GRASPS` and `PICTURES` list the columns; docs/how-to/exchange/huggingface.md describes them with units and frames."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence

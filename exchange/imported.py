@@ -2,8 +2,6 @@
 
 A pickle can call any function while it is loaded; this module allows only arrays, numbers, strings and containers."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 docs/how-to/exchange/lerobot.md describes the features. A frame is a waypoint of the trajectory, from the standoff to
 the squeeze; `action` is the next frame's state, at the end the lift. The importer reads only exports of graspd."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Check of exported files: a library for each file's format opens the file."""
 
-from __future__ import annotations
-
 import csv
 import json
 import tarfile

@@ -1,7 +1,5 @@
 """Plan of an export for training: grasps of many shards, pictures, splits, names, and the summary."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections import defaultdict

@@ -13,8 +13,6 @@ URDF. Some versions of the file have three Euler angles (rotating axes x, y, z) 
 
 Reference grasps (`reference-grasps/1`): JSON with poses as matrices, joints by name, and published scores."""
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from pathlib import Path

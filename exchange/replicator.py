@@ -3,8 +3,6 @@
 The export has the image files of `worker.rendering.export`, and arrays of bounding boxes with JSON files of labels,
 prims and cameras. USD's conventions: matrices act on row vectors, cameras look along -z with y up."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """Export of a shard's grasps with their trajectories in the format of a robot or simulator."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Validation and metrics of imported grasps, written as base shards with their origin."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

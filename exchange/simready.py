@@ -4,8 +4,6 @@ Feature: https://nvidia.github.io/simready-foundation/latest/features/FET_005_ST
 a line (`BasisCurves`) below the default prim, named `grasp_identifier...`, along which opposing fingers close; PMT.001
 is a physics material on each collider. Hand frames, joint positions and provenance are below `graspd`."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Sequence
@@ -44,7 +42,7 @@ _TOLD: Final = ("shard_id", "method", "verdict_level", "code_version", "created"
 
 
 def closing_lines(case: Case, grasp: Posture) -> Floats:
-    """Return the line (N, 2, 3) along which the hand closes in each grasp: object frame [m]; nan without contacts.
+    """Return the closing line (N, 2, 3) of each grasp in the object frame [m]; nan without contacts.
     It joins the mean contacts of two opposing sides and ends `BEYOND_M` outside the object. The sides face along the
     line between the two contacts whose normals are closest to it."""
     probe = probe_of(case.hand, case.obj, hand_points=HAND_POINTS, object_points=64)
@@ -71,7 +69,7 @@ def closing_lines(case: Case, grasp: Posture) -> Floats:
 
 @dataclass(frozen=True)
 class _Grasps:
-    """Selected grasps of one shard with their lines; `unit` is that of the numbers in metres of the object's file."""
+    """Selected grasps of one shard with their lines; `unit` [m] is that of the object's file."""
 
     shard: Shard
     case: Case
@@ -81,7 +79,7 @@ class _Grasps:
 
 
 def write_simready(source: Path, grasps: Sequence[Path], out: Path, *, best: int = 10) -> ExportSummary:
-    """Write a copy of an object's USD file with the best valid grasps of base shards, by epsilon; 0 for all.
+    """Write a copy of an object's USD file with the `best` valid grasps by epsilon; 0 for all.
     Mass, colliders and a physics material are added where the file has none; references stay valid.
     Raises InputError: the files are not USD, the grasps are of another object, or none is valid."""
     if not all(path.suffix.lower() in SUFFIXES[:3] for path in (source, out)):
@@ -175,7 +173,7 @@ class _Asset:
                 joints.Set(part.joint_positions[row].tolist())
 
     def _add_frame(self, path: Any, pose: Floats) -> Any:
-        """Add the frame of the hand's root link at a pose (7,) in the object frame [m], without scale in the stage."""
+        """Add the frame of the hand's root link at a pose (7,) in the object frame [m], without scale."""
         matrix = pose_to_matrix(pose)
         matrix[:3, 3] /= self.metres
         frame = UsdGeom.Xform.Define(self.stage, path)

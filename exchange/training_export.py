@@ -3,8 +3,6 @@
 Objects of a family have similar distributions of the distance between two random surface points (D2 of Osada et al.,
 "Shape distributions", 2002), relative to its root mean square. Moved, mirrored, scaled or remeshed copies are equal."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

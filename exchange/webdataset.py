@@ -2,8 +2,6 @@
 
 docs/how-to/exchange/webdataset.md describes the members. Data that a views shard lacks are omitted."""
 
-from __future__ import annotations
-
 import io
 import json
 import tarfile

@@ -1,4 +1,4 @@
-"""Keyword arguments of the options, written by `python -m graspd.service.docs`."""
+"""Keyword arguments of the options, written by `python -m docs.tables`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

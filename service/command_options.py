@@ -1,7 +1,5 @@
 """Command-line options, derived from the option tables of `service.model.options`."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import math

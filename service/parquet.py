@@ -1,7 +1,5 @@
 """Parquet files by pyarrow, an optional dependency."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path

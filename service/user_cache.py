@@ -4,8 +4,6 @@ Processes share a folder without locks: writes are atomic, and two writers of on
 foreign entries count as absent; a failed write only costs time.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import os

@@ -2,8 +2,6 @@
 
 Results are a table, JSON and a plot."""
 
-from __future__ import annotations
-
 import json
 import resource
 import time

@@ -1,6 +1,4 @@
-"""Agreement of several engines on the same grasps: success, Cohen's κ, kinds of losses and the price of a verdict."""
-
-from __future__ import annotations
+"""Agreement of engines on the same grasps: success, Cohen's κ, kinds of losses, price of a verdict."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -39,7 +37,7 @@ def compare_engines(
 
 
 def summarise(files: Sequence[Sequence[EngineVerdicts]]) -> dict[str, Any]:
-    """Return n, success and core_ms by engine, and agreement and κ of each pair, over all grasps of several files.
+    """Return n, success and core_ms by engine, agreement and κ of each pair, over grasps of several files.
     `differences` counts by kind of loss the grasps that hold in one engine of a pair only."""
     names = [one.engine for one in files[0]]
     held = {name: np.concatenate([one[k].success == 1 for one in files]) for k, name in enumerate(names)}

@@ -1,7 +1,5 @@
 """Evaluation of a set of grasps as one row: success by the validator, and medians of all metrics."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable

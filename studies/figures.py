@@ -1,7 +1,5 @@
 """Layout that all studies share: figures, their colours, and tables in Markdown."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 

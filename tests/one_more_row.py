@@ -44,9 +44,9 @@ def of_option(folder: Path) -> dict[str, Any]:
     from typer.testing import CliRunner
 
     import graspd
+    from docs.tables import keywords_stub, options_table
     from graspd.api.app import create_app
     from graspd.cli import build_app
-    from graspd.service.docs import keywords_stub, options_table
     from graspd.service.settings import Settings
     from tests.api.conftest import BASE_URL
     from tests.indexes import open_services
@@ -81,8 +81,8 @@ def of_metric(folder: Path, older_index: str) -> dict[str, Any]:
     from fastapi.testclient import TestClient
     from sqlalchemy import inspect as inspected
 
+    from docs.tables import schema_table
     from graspd.api.app import create_app
-    from graspd.service.docs import schema_table
     from graspd.service.index.index import Index
     from graspd.service.model.states import Stage
     from graspd.service.store.columns import SCHEMAS

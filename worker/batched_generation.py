@@ -1,7 +1,5 @@
 """Several batches of a job: one after the other, or in waves that share one launch of the planner."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence

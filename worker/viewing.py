@@ -1,8 +1,6 @@
 """Viewer: a viser server that shows the grasps of one file, with a slider over the trajectory.
 Hand, object and scene are nodes. Lengths are in metres; poses are x y z, then quaternion w x y z."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import socket
@@ -16,14 +14,7 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import Box, SceneSpec, scene_supports
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
-from graspd.service.readers.trajectories import (
-    Waypoint,
-    scene_spec_of,
-    slider_positions,
-    trajectory_of,
-    waypoint_at,
-    wrist_angles,
-)
+from graspd.service.readers import trajectories
 from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
@@ -90,7 +81,7 @@ class Models:
         for node in self._around:
             node.visible = on
 
-    def pose(self, point: Waypoint, *, wrist: Floats | None = None, contacts: bool) -> Floats:
+    def pose(self, point: trajectories.Waypoint, *, wrist: Floats | None = None, contacts: bool) -> Floats:
         """Show a posture with wrist angles (1, U) of a mounted hand.
         Return distances (P,) of hand points from the object [m], at most the probe's reach."""
         posture = point.hand_pose[None], point.joint_positions[None]
@@ -163,11 +154,11 @@ class Viewer:
         self._choices = _rows_by_filter(shown.shard)
         self._rows = next(iter(self._choices.values()))
         self._at, self._lock = 0, threading.RLock()
-        spec = scene_spec_of(shown.shard) or SceneSpec()
+        spec = trajectories.scene_spec_of(shown.shard) or SceneSpec()
         self._supports: Supports = scene_supports(spec)
         self.server = _start_server(host, port)
         self.models = Models(self.server.scene, shown.hand, shown.obj, mounted=self._wrist is not None)
-        self._way = trajectory_of(shown.shard, self.row)
+        self._way = trajectories.trajectory_of(shown.shard, self.row)
         self._controls()
         self._load_grasp()
         self._aim_camera()
@@ -177,7 +168,7 @@ class Viewer:
 
     @property
     def _wrist(self) -> Floats | None:
-        return wrist_angles(self._shown.shard, np.array([self.row]))
+        return trajectories.wrist_angles(self._shown.shard, np.array([self.row]))
 
     @property
     def url(self) -> str:
@@ -215,7 +206,7 @@ class Viewer:
         """Draw the posture at the slider's position."""
         with self._lock:
             place = float(self.slider.value)
-            point, contacts = waypoint_at(self._way, place), bool(self._contacts.value)
+            point, contacts = trajectories.waypoint_at(self._way, place), bool(self._contacts.value)
             distance = self.models.pose(point, wrist=self._wrist, contacts=contacts)
             self.models.show_scene(bool(self._scene.value))
             touching, least = int((distance < 0.001).sum()), 1e3 * float(distance.min())
@@ -238,7 +229,7 @@ class Viewer:
         self._title = gui.add_markdown("")
         turn = gui.add_button_group("grasp", ("previous", "next"))
         choice = gui.add_dropdown("show", self.filters, initial_value=self.filters[0])
-        places = slider_positions(self._way)
+        places = trajectories.slider_positions(self._way)
         marks = tuple((float(place), point.name) for place, point in zip(places, self._way, strict=True) if point.name)
         start = next(place for place, name in marks if name == "grasp")
         self.slider = gui.add_slider("trajectory", 0.0, float(places[-1]), 0.01, start, marks=marks)
@@ -253,7 +244,7 @@ class Viewer:
 
     def _load_grasp(self) -> None:
         shard, row = self._shown.shard, self.row
-        self._way = trajectory_of(shard, row)
+        self._way = trajectories.trajectory_of(shard, row)
         number = int(self._arrays["grasp/scene_index"][row]) if "grasp/scene_index" in self._arrays else 0
         pose = np.asarray(self._arrays["scene/object_pose"][number], float) if self._supports else IDENTITY_POSE
         self.models.show_surroundings(self._supports, pose, self._shown.neighbours, number)
@@ -330,7 +321,7 @@ def _metrics_text(shard: Shard, row: int) -> str:
 
 
 def _motion_label(way: Any, place: float) -> str:
-    places = slider_positions(way)
+    places = trajectories.slider_positions(way)
     names = [(float(at), point.name) for at, point in zip(places, way, strict=True) if point.name]
     near = next((name for at, name in names if abs(at - place) < 0.02), "")
     if near:

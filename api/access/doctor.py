@@ -1,7 +1,5 @@
 """Checks of API keys for `graspd doctor`: whether an exposed service has keys, and when they expire."""
 
-from __future__ import annotations
-
 import stat
 from datetime import UTC, datetime, timedelta
 from typing import Final

@@ -5,8 +5,6 @@ From submission to end, a job counts with its requested grasps. The index is que
 would be exceeded, so a submission needs one round trip.
 """
 
-from __future__ import annotations
-
 import logging
 import uuid
 from collections.abc import Callable, Collection, Iterator

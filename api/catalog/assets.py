@@ -1,7 +1,5 @@
 """Hands, objects and networks: upload, correction and deletion."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging

@@ -1,7 +1,5 @@
 """Grasps: search by metrics, distributions of a job, and details of one grasp from its base shard."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
@@ -13,16 +11,8 @@ from graspd.api.access.auth import project_scope
 from graspd.service.index.queries.grasps import GraspFilter, GraspSort, Metric
 from graspd.service.index.queries.statistics import GraspKinds
 from graspd.service.index.views import GraspView, JobView, Page
+from graspd.service.model import metrics
 from graspd.service.model.errors import InputError, LimitError, NotFoundError
-from graspd.service.model.metrics import (
-    DIRECTION_CELLS,
-    GRASP_METRICS,
-    GraspType,
-    IndexLevel,
-    entropy_bits,
-    evenness,
-    indexed_metrics,
-)
 from graspd.service.model.records import MOST_TAGGED, Grasp
 from graspd.service.model.scene_spec import scene_supports
 from graspd.service.pipeline.backends import Services
@@ -36,7 +26,9 @@ _KEPT_STATISTICS: Final = 256
 _KEPT_SHARDS: Final = 64
 _BINS: Final = 20
 _SHARED: Final = GraspFilter.model_fields.keys() & models.GraspQuery.model_fields.keys()
-MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed_metrics(IndexLevel.OFFERED))
+MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(
+    metric.name for metric in metrics.indexed_metrics(metrics.IndexLevel.OFFERED)
+)
 
 
 class Grasps:
@@ -88,7 +80,7 @@ class Grasps:
             thresholds_m=_finite_list(file["quality/thresholds_m"]),
             sweep={
                 metric.name: _finite_list(file[metric.path][row])
-                for metric in GRASP_METRICS
+                for metric in metrics.GRASP_METRICS
                 if metric.swept and metric.path in file.arrays
             },
             way=_read_waypoints(file, row),
@@ -132,18 +124,18 @@ def _diversity(kinds: GraspKinds) -> models.Diversity | None:
         return None
     return models.Diversity(
         grasps=sum(kinds.cells.values()),
-        types={kind.name.lower(): kinds.types[kind] for kind in GraspType if kinds.types.get(kind)},
-        type_entropy_bits=round(entropy_bits(kinds.types.values()), 4),
+        types={kind.name.lower(): kinds.types[kind] for kind in metrics.GraspType if kinds.types.get(kind)},
+        type_entropy_bits=round(metrics.entropy_bits(kinds.types.values()), 4),
         directions_used=len(kinds.cells),
-        direction_entropy_bits=round(entropy_bits(kinds.cells.values()), 4),
-        evenness=round(evenness(kinds.cells.values(), DIRECTION_CELLS), 4),
+        direction_entropy_bits=round(metrics.entropy_bits(kinds.cells.values()), 4),
+        evenness=round(metrics.evenness(kinds.cells.values(), metrics.DIRECTION_CELLS), 4),
     )
 
 
 def _metric_bounds(query: models.GraspQuery, end: Literal["min", "max"]) -> dict[Metric, float]:
     values = {metric: getattr(query, f"{end}_{metric}", None) for metric in MEAN_METRICS}
     found = {metric: value for metric, value in values.items() if value is not None}
-    return found if query.type is None else {"grasp_type": float(GraspType[query.type.upper()])} | found
+    return found if query.type is None else {"grasp_type": float(metrics.GraspType[query.type.upper()])} | found
 
 
 _POSTURES: Final = ("pregrasp", "grasp", "squeeze")

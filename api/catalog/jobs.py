@@ -1,7 +1,5 @@
 """Jobs and their shards: submission within quotas, progress, rate, expected end, changes by owners."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import threading

@@ -1,7 +1,5 @@
 """Overview of the service: workers, queue, statistics, health, usage of projects, and deletions."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io
@@ -22,15 +20,8 @@ from graspd.api.models import Health, Part, Worker
 from graspd.service.index.notes import Damage
 from graspd.service.index.queries.overview import read_index_status
 from graspd.service.index.views import FailureGroup, Stats, TaskView, UsageDay, View
+from graspd.service.model import errors
 from graspd.service.model.digests import digest_json
-from graspd.service.model.errors import (
-    BusyError,
-    GraspdError,
-    InputError,
-    NotFoundError,
-    StoreUnavailable,
-    UnavailableError,
-)
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.states import Priority, Stage
 from graspd.service.pipeline import deletion
@@ -66,7 +57,7 @@ class Overview:
         outputs, visible = self._services.index.feed.outputs(tasks), self._tasks_in_scope(tasks)
         try:
             heartbeats = self._queue_status().workers
-        except UnavailableError:
+        except errors.UnavailableError:
             heartbeats = {}
         return [
             Worker(
@@ -83,7 +74,7 @@ class Overview:
             return None
         try:
             return self._services.index.jobs.task(worker.task_id, scope=project_scope())
-        except NotFoundError:
+        except errors.NotFoundError:
             return None
 
     def stats(self) -> Stats:
@@ -115,11 +106,11 @@ class Overview:
         found = MetricsSnapshot()
         latencies = {name: part.latency_ms for name, part in self.health().parts.items()}
         found.add_parts({name: None if ms is None else ms / 1000 for name, ms in latencies.items()})
-        with contextlib.suppress(UnavailableError):
+        with contextlib.suppress(errors.UnavailableError):
             queue = self._services.queue
             found.add_queue(self._queue_status(), is_kept=queue.is_announced(PART))
             found.add_sums(queue.counter_sums())
-        with contextlib.suppress(UnavailableError):
+        with contextlib.suppress(errors.UnavailableError):
             found.add_index(read_index_status(self._services.index.database))
         return found
 
@@ -186,9 +177,9 @@ class Probes:
         if service != self._service:
             try:
                 check_service(self._services.store, service)
-            except BusyError as error:
+            except errors.BusyError as error:
                 return part.model_copy(update={"ok": False, "detail": str(error)})
-            except StoreUnavailable:
+            except errors.StoreUnavailable:
                 return part  # The probe of the store reports this error.
             self._service = service
         return part
@@ -210,7 +201,7 @@ class Probes:
         try:
             fit = [beat for beat in self._services.queue.workers() if beat.state != "quarantined"]
             return self._services.queue.is_announced(PART), len(fit)
-        except UnavailableError:
+        except errors.UnavailableError:
             return False, 0
 
 
@@ -233,7 +224,7 @@ class _Probe:
         try:
             self._part = self._question()
         except Exception as error:
-            name = "" if isinstance(error, GraspdError) else f"{type(error).__name__}: "
+            name = "" if isinstance(error, errors.GraspdError) else f"{type(error).__name__}: "
             self._part = Part(ok=False, detail=f"{name}{error}")
 
 
@@ -254,9 +245,9 @@ class Usage:
         last = until or datetime.now(UTC).date()
         first = since or last - timedelta(days=min(DAYS - 1, last.toordinal() - 1))
         if first > last:
-            raise InputError(f"`since` {first} is after `until` {last}")
+            raise errors.InputError(f"`since` {first} is after `until` {last}")
         if (last - first).days >= MOST_DAYS:
-            raise InputError(f"at most {MOST_DAYS} days can be listed at once; request fewer")
+            raise errors.InputError(f"at most {MOST_DAYS} days can be listed at once; request fewer")
         return self._services.index.usage.days(first.isoformat(), last.isoformat(), scope=project_scope())
 
     def limits(self) -> dict[str, ProjectLimits]:

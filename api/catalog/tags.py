@@ -1,7 +1,5 @@
 """Tags for grasps of a project, and exports of selected grasps as CSV, JSON or shards in a ZIP."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Pages of datasets: hand x object matrix of all jobs and of each dataset, actions, and comparison."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Final
 from urllib.parse import urlencode

@@ -1,7 +1,5 @@
 """Figures of the pages: charts as SVG without scripts, the hand x object matrix, and maps of failure."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A refused file stays in the store, and the form refers to it: the next submissio
 options. Each fix that a refusal suggests is a button.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Pages of grasps: filtered list, one grasp in 3D, and forms to tag, untag and export grasps."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Final, TypeVar

@@ -1,7 +1,5 @@
 """Pages of hands: the list, and one hand in 3D with a form to correct guesses about it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Annotated, Any, Final
 

@@ -1,7 +1,5 @@
 """Page of a job: stages, metrics, best grasps, attempts, files; pictures as PNG or thumbnail."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from functools import lru_cache, partial

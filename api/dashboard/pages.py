@@ -1,7 +1,5 @@
 """Pages of the service: home, workers, charts, failure maps, usage, deletions, problem types, session."""
 
-from __future__ import annotations
-
 import time
 from collections import defaultdict
 from collections.abc import AsyncIterable
@@ -21,17 +19,7 @@ from graspd.api.dashboard.forms import FormEstimates
 from graspd.api.dashboard.job_pages import ShardPictures
 from graspd.api.dashboard.rendering import environment, render
 from graspd.api.models import STAGE_LABELS
-from graspd.api.routes.dependencies import (
-    READ,
-    SUBMIT,
-    DatasetsOf,
-    DeletionsOf,
-    JobsOf,
-    OverviewOf,
-    StoreOf,
-    TagsOf,
-    UsageOf,
-)
+from graspd.api.routes import dependencies
 from graspd.api.routes.system import Since, Until
 from graspd.service.index.views import WorkerView
 from graspd.service.model.errors import ERRORS, InputError, UnavailableError
@@ -48,12 +36,12 @@ _STUDY_S: Final = 10
 router = APIRouter(include_in_schema=False)
 
 
-@router.get("/", dependencies=READ)
+@router.get("/", dependencies=dependencies.READ)
 def home(
     request: Request,
-    overview: OverviewOf,
-    jobs: JobsOf,
-    datasets: DatasetsOf,
+    overview: dependencies.OverviewOf,
+    jobs: dependencies.JobsOf,
+    datasets: dependencies.DatasetsOf,
     state: str = "",
     cursor: Annotated[str | None, Query(max_length=512)] = None,
 ) -> HTMLResponse:
@@ -79,8 +67,8 @@ def home(
     )
 
 
-@router.get("/workers", dependencies=READ)
-def workers_page(request: Request, overview: OverviewOf) -> HTMLResponse:
+@router.get("/workers", dependencies=dependencies.READ)
+def workers_page(request: Request, overview: dependencies.OverviewOf) -> HTMLResponse:
     workers = [worker for worker in overview.workers() if is_recent(worker)]
     return render(
         request,
@@ -97,9 +85,9 @@ def workers_page(request: Request, overview: OverviewOf) -> HTMLResponse:
     )
 
 
-@router.get("/chart", dependencies=READ)
+@router.get("/chart", dependencies=dependencies.READ)
 def chart_page(
-    request: Request, store: StoreOf, y: str = "gsr", lifts: str = "lift", hand: str = "", object: str = ""
+    request: Request, store: dependencies.StoreOf, y: str = "gsr", lifts: str = "lift", hand: str = "", object: str = ""
 ) -> HTMLResponse:
     measured = tradeoff.load_charts(store)
     axis = {False: y if y in tradeoff.FREE else "gsr", True: lifts if lifts in tradeoff.IN_SCENES else "lift"}
@@ -126,8 +114,8 @@ def chart_page(
     )
 
 
-@router.get("/stability", dependencies=READ)
-def stability_page(request: Request, store: StoreOf) -> HTMLResponse:
+@router.get("/stability", dependencies=dependencies.READ)
+def stability_page(request: Request, store: dependencies.StoreOf) -> HTMLResponse:
     measured = figures.load_stability(store)
     maps = [figures.draw_map(one) for one in measured.maps] if measured else []
     return render(request, "stability.html", page="/stability", poll_s=_STUDY_S, measured=measured, maps=maps)
@@ -154,8 +142,8 @@ def stage_depths(overview: Overview) -> list[tuple[str, int]]:
 _SUMMED = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
 
 
-@router.get("/usage", dependencies=READ)
-def usage_page(request: Request, usage: UsageOf, since: Since = None, until: Until = None) -> HTMLResponse:
+@router.get("/usage", dependencies=dependencies.READ)
+def usage_page(request: Request, usage: dependencies.UsageOf, since: Since = None, until: Until = None) -> HTMLResponse:
     days = usage.days(since, until)
     limits = usage.limits()
     today = datetime.now(UTC).date().isoformat()
@@ -185,38 +173,38 @@ SHORT_ID = 12
 Typed = Annotated[str, Form(max_length=64)]
 
 
-@router.get("/deleted", dependencies=READ)
-def deleted_page(request: Request, deletions: DeletionsOf, done: str = "") -> HTMLResponse:
+@router.get("/deleted", dependencies=dependencies.READ)
+def deleted_page(request: Request, deletions: dependencies.DeletionsOf, done: str = "") -> HTMLResponse:
     """Show the deletions that can be undone; `done` is the id of the latest deletion."""
     found = deletions.list_restorable()
     return render(request, "deleted.html", found=found, just_now=next((one for one in found if one.id == done), None))
 
 
-@router.post("/deleted/{what}/{name}/restore", dependencies=SUBMIT)
-def restore(what: What, name: str, deletions: DeletionsOf) -> RedirectResponse:
+@router.post("/deleted/{what}/{name}/restore", dependencies=dependencies.SUBMIT)
+def restore(what: What, name: str, deletions: dependencies.DeletionsOf) -> RedirectResponse:
     found = deletions.restore(what, name)
     pages = {"job": f"/jobs/{found.id}", "dataset": f"/datasets/{found.id}", "hand": f"/hands/{found.name}"}
     return RedirectResponse(pages.get(what, "/grasps" if what == "tag" else "/deleted"), status_code=303)
 
 
-@router.post("/datasets/{name}/delete", dependencies=SUBMIT)
+@router.post("/datasets/{name}/delete", dependencies=dependencies.SUBMIT)
 def delete_dataset(
-    name: str, datasets: DatasetsOf, typed: Typed = "", with_snapshots: Annotated[bool, Form()] = False
+    name: str, datasets: dependencies.DatasetsOf, typed: Typed = "", with_snapshots: Annotated[bool, Form()] = False
 ) -> RedirectResponse:
     _require_confirmation(typed, name)
     datasets.delete(name, with_snapshots=with_snapshots)
     return _redirect_to_deletions(name)
 
 
-@router.post("/jobs/{job_id}/delete", dependencies=SUBMIT)
-def delete_job(job_id: str, jobs: JobsOf, typed: Typed = "") -> RedirectResponse:
+@router.post("/jobs/{job_id}/delete", dependencies=dependencies.SUBMIT)
+def delete_job(job_id: str, jobs: dependencies.JobsOf, typed: Typed = "") -> RedirectResponse:
     _require_confirmation(typed, job_id, job_id[:SHORT_ID])
     jobs.delete(job_id)
     return _redirect_to_deletions(job_id)
 
 
-@router.post("/tags/{name}/delete", dependencies=SUBMIT)
-def delete_tag(name: str, tags: TagsOf, typed: Typed = "") -> RedirectResponse:
+@router.post("/tags/{name}/delete", dependencies=dependencies.SUBMIT)
+def delete_tag(name: str, tags: dependencies.TagsOf, typed: Typed = "") -> RedirectResponse:
     _require_confirmation(typed, name)
     tag = tags.get(name)
     tags.delete(name)
@@ -249,13 +237,13 @@ def install_dashboard(app: FastAPI, services: Services) -> None:
     app.state.expectations = FormEstimates(services.index)
 
 
-@router.get("/events", dependencies=READ, response_class=EventSourceResponse)
-async def watch(request: Request, overview: OverviewOf) -> AsyncIterable[ServerSentEvent]:
+@router.get("/events", dependencies=dependencies.READ, response_class=EventSourceResponse)
+async def watch(request: Request, overview: dependencies.OverviewOf) -> AsyncIterable[ServerSentEvent]:
     async for event in events.service_events(overview, request):
         yield event
 
 
-@router.get("/docs", dependencies=READ)
+@router.get("/docs", dependencies=dependencies.READ)
 def explorer(request: Request) -> HTMLResponse:
     return render(request, "explorer.html")
 

@@ -1,7 +1,5 @@
 """Rendering of templates, and code snippets that load a job's files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """Charts of speed against accuracy, published by `graspd chart`: read, aggregated, drawn as SVG."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress

@@ -4,8 +4,6 @@ The application's paths have no prefix. `RootPath` removes the prefix from paths
 did, and adds it to response headers; rendering adds it to addresses in pages (`add_prefix`).
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import time

@@ -1,7 +1,5 @@
 """`/v1/hands`, `/v1/objects` and `/v1/networks`; a correction of a hand creates another hand."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """`/v1/datasets` and `/v1/object-sets`: matrices of jobs, and named sets of objects."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Response

@@ -1,7 +1,5 @@
 """Dependencies of routes: services, permissions, pages, threads, conditions (RFC 9110 §13)."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 from collections.abc import Callable, Coroutine

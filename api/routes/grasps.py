@@ -1,22 +1,12 @@
 """`/v1/grasps`: index of all grasps; `/v1/tags`: names that users give to grasps."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
+from graspd.api import models
 from graspd.api.catalog.tags import MEDIA_TYPES, Format, GraspExports, Tags
-from graspd.api.models import (
-    GraspDetail,
-    GraspExportQuery,
-    GraspPageQuery,
-    GraspQuery,
-    Selection,
-    TagChange,
-    TagRequest,
-)
 from graspd.api.problems import problem_responses
 from graspd.api.routes.dependencies import READ, SUBMIT, ExportsOf, GraspsOf, Paging, TagsOf
 from graspd.service.index.views import GraspView, Page, TagView
@@ -25,7 +15,7 @@ router = APIRouter(prefix="/v1/grasps", tags=["grasps"])
 
 
 @router.get("/{shard_id}/{row}", dependencies=READ, responses=problem_responses(404))
-def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> GraspDetail:
+def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> models.GraspDetail:
     """Return one grasp with its postures, and its metrics at every contact threshold."""
     response.headers["Cache-Control"] = "private, max-age=86400"
     return grasps.get(shard_id, row)
@@ -43,15 +33,15 @@ def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> 
     ),
 )
 async def export_grasps(
-    request: Request, tags: TagsOf, exports: ExportsOf, query: Annotated[GraspExportQuery, Query()]
+    request: Request, tags: TagsOf, exports: ExportsOf, query: Annotated[models.GraspExportQuery, Query()]
 ) -> StreamingResponse:
     """Export all grasps that pass every filter: rows as CSV or JSON, or base shards in a ZIP."""
-    chosen = GraspQuery.model_validate(query.model_dump(exclude={"format"}))
-    return await export_response(request, tags, exports, Selection(filter=chosen), query.format)
+    chosen = models.GraspQuery.model_validate(query.model_dump(exclude={"format"}))
+    return await export_response(request, tags, exports, models.Selection(filter=chosen), query.format)
 
 
 async def export_response(
-    request: Request, tags: Tags, exports: GraspExports, selection: Selection, format: Format
+    request: Request, tags: Tags, exports: GraspExports, selection: models.Selection, format: Format
 ) -> StreamingResponse:
     said = selection.model_dump(mode="json", exclude_none=True)
     size, chunks = await request.app.state.exports.run(
@@ -64,7 +54,7 @@ async def export_response(
 
 @router.get("", dependencies=READ, responses=problem_responses(404))
 def list_grasps(
-    request: Request, response: Response, grasps: GraspsOf, query: Annotated[GraspPageQuery, Query()]
+    request: Request, response: Response, grasps: GraspsOf, query: Annotated[models.GraspPageQuery, Query()]
 ) -> Page[GraspView]:
     """List grasps that pass every filter, in the requested order."""
     paging = Paging(request, response, query.limit, query.cursor)
@@ -83,7 +73,7 @@ def list_tags(tags: TagsOf) -> list[TagView]:
 
 
 @tag_router.post("", dependencies=SUBMIT, responses=problem_responses(400, 404, 409))
-def give_tag(body: TagRequest, tags: TagsOf) -> TagChange:
+def give_tag(body: models.TagRequest, tags: TagsOf) -> models.TagChange:
     """Give a tag to listed or filtered grasps; create the tag if it is new."""
     return tags.tag_grasps(body.name, body)
 
@@ -95,7 +85,7 @@ def get_tag(name: TagName, tags: TagsOf) -> TagView:
 
 
 @tag_router.post("/{name}/remove", dependencies=SUBMIT, responses=problem_responses(400, 404, 409))
-def remove_tag(name: TagName, body: Selection, tags: TagsOf) -> TagChange:
+def remove_tag(name: TagName, body: models.Selection, tags: TagsOf) -> models.TagChange:
     """Remove a tag from listed or filtered grasps."""
     return tags.untag_grasps(name, body)
 

@@ -1,7 +1,5 @@
 """`/v1/jobs`: submit, list, watch, cancel, retry, delete; `/v1/shards`: HDF5 files, with byte ranges."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import AsyncIterable
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """Workers, statistics, health, metrics, usage, deletions, restores, ended jobs and datasets, webhooks."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import AsyncIterable
 from datetime import date

@@ -3,8 +3,6 @@
 GraspIt! closes joints in small steps and moves back after a collision. Here distances limit the steps, so that no step
 passes through the object. Both end in contact, here within `TOUCH_M`."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from typing import Any, Final

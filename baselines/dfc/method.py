@@ -2,8 +2,6 @@
 
 The planner returns all hands; `info["passed"]` marks those that the published code would accept."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from itertools import combinations
@@ -16,14 +14,7 @@ from pydantic import Field
 
 from graspd.baselines.common import create_grasp_set, frame_along, inner_side_points, load_pair
 from graspd.baselines.dfc import kernels
-from graspd.service.model.transforms import (
-    IDENTITY_POSE,
-    Floats,
-    apply,
-    quat_from_axis_angle,
-    quat_from_matrix,
-    quat_multiply,
-)
+from graspd.service.model import transforms
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.kinematics import body_poses
@@ -59,7 +50,7 @@ class Dfc:
         pair = load_pair(hand, obj, run.device, kernels)
         steps = StepCounter(wanted.count * (self.options.steps + 1), run)
 
-        def work(indices: range) -> tuple[HandState, Floats]:
+        def work(indices: range) -> tuple[HandState, transforms.Floats]:
             starts = sample_starts(hand, obj, seed=wanted.seed, batch=wanted.batch, indices=indices)
             steps(len(indices), "starts")
             descent = Descent(pair, starts, [[wanted.seed, wanted.batch, index] for index in indices])
@@ -96,10 +87,10 @@ def _start(hand: HandModel, obj: ObjectModel, rng: np.random.Generator) -> tuple
     axis, angle = side / np.linalg.norm(side), rng.uniform(0.0, TILT)
     normal = normal * np.cos(angle) + np.cross(axis, normal) * np.sin(angle)
     align = frame_along(-normal) @ frame_along(hand.palm.approach).T
-    roll = quat_from_axis_angle(-normal, np.array(rng.uniform(0.0, 2 * np.pi)))
+    roll = transforms.quat_from_axis_angle(-normal, np.array(rng.uniform(0.0, 2 * np.pi)))
     q = np.clip(hand.preshape + POSTURE * hand.span * rng.normal(size=hand.dofs), hand.lower, hand.upper)
     pivot = points[0] + rng.uniform(*DISTANCE) * normal - obj.centre_of_mass
-    return pivot, quat_multiply(roll, quat_from_matrix(align)), q
+    return pivot, transforms.quat_multiply(roll, transforms.quat_from_matrix(align)), q
 
 
 Ints = NDArray[np.int32]
@@ -114,11 +105,11 @@ CHUNK: Final = 50
 INFINITE: Final = 1e30
 
 
-def key_points(hand: HandModel) -> tuple[Ints, Floats, Ints, Ints]:
+def key_points(hand: HandModel) -> tuple[Ints, transforms.Floats, Ints, Ints]:
     """Return bodies (K,), centres (K, 3), and repelling pairs (two index arrays) of the hand's pieces."""
     body = np.array([piece.body for piece in hand.pieces], np.int32)
     place = np.array([piece.vertices.mean(axis=0) for piece in hand.pieces])
-    rest = apply(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0][body], place)
+    rest = transforms.apply(body_poses(hand, transforms.IDENTITY_POSE, hand.expand(hand.preshape))[0][body], place)
     pairs = [
         (i, j)
         for i, j in combinations(range(len(body)), 2)
@@ -210,6 +201,6 @@ class Descent:
         hand = self.pair.hand.model
         return HandState(found.pivot, found.rotation, np.clip(found.q, hand.lower, hand.upper))
 
-    def energies(self) -> Floats:
+    def energies(self) -> transforms.Floats:
         """Return (n, 5) E_fc, E_dis, E_pen, E_spen, E_joints, unweighted."""
         return self.terms.numpy().astype(float)

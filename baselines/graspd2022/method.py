@@ -2,8 +2,6 @@
 
 A grid of signed distances with trilinear interpolation represents the object."""
 
-from __future__ import annotations
-
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Input of the writers of robot formats, and functions that these writers share."""
 
-from __future__ import annotations
-
 import pathlib
 from dataclasses import dataclass
 from typing import Any

@@ -2,8 +2,6 @@
 
 Poses are those of the tool frame, MoveIt's end-effector link. `effort` is stiffness times distance from the grasp."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final

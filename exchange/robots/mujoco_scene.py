@@ -3,8 +3,6 @@
 The world is the frame of the grasps, z up in a scene. A weld to a mocap body moves the hand's root. Position actuators
 have the names of the degrees of freedom. Gravity acts only in scenes with supports, and not on the hand."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from itertools import product, zip_longest

@@ -2,8 +2,6 @@
 
 A stage is in metres, z up, at 24 time codes per second. Default values show the grasp, time samples the motion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final

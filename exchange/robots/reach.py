@@ -3,8 +3,6 @@
 The library mink solves inverse kinematics by differential steps, each a quadratic program within the joints' limits. An
 arm that jumps between consecutive poses of the trajectory cannot execute the grasp."""
 
-from __future__ import annotations
-
 import pathlib
 from collections import Counter
 from collections.abc import Mapping, Sequence

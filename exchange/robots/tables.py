@@ -4,8 +4,6 @@ Poses are those of the tool frame; joint columns [rad or m] have the joints' nam
 the URDF couples. Isaac Sim uses frame names `..._frame_link`, Isaac ROS `..._frame`, so the file has both. Further
 postures and epsilon are under the key `graspd`, which readers ignore."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable, Sequence
 from pathlib import Path

@@ -16,21 +16,9 @@ from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
 from graspd.api.formatting import count, minute, percent, size
+from graspd.client import reports
 from graspd.client.add_commands import name_of_set, upload_set
 from graspd.client.client import Client, request_path
-from graspd.client.reports import (
-    UrlOption,
-    YesOption,
-    confirm,
-    open_client,
-    print_cells,
-    print_dataset,
-    print_estimate,
-    print_rows,
-    report_deletion,
-    restore,
-    watch_dataset,
-)
 from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json, print_result
 from graspd.service.command_options import parse_pairs, validate_options, with_options
 from graspd.service.index.views import DatasetView
@@ -152,7 +140,7 @@ def create(
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Start without confirmation.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the estimated cost and exit.")] = False,
     wait: WaitOption = False,
-    url: UrlOption = None,
+    url: reports.UrlOption = None,
     json: JsonFlag = False,
     *,
     options: dict[str, Any],
@@ -162,11 +150,11 @@ def create(
     asked = dataset_plan(spec, name=name, hands=hands, objects=objects, options=options)
     if not asked.name:
         raise InputError("give a name: graspd datasets create NAME, or name in the file of --spec")
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         files, matrix = _matrix(client, asked)
         request = validate_options(DatasetRequest, {"name": asked.name, **matrix})
         found = _estimate(client, matrix, files)
-        print_estimate(found, console)
+        reports.print_estimate(found, console)
         if dry_run:
             _emit(json, estimate=found)
             return
@@ -181,12 +169,12 @@ def create(
             request = validate_options(DatasetRequest, {"name": asked.name, **matrix, "objects": []})
         dataset = client.create_dataset(request)
         if wait:
-            dataset = watch_dataset(client, asked.name, plain_console(stderr=True))
+            dataset = reports.watch_dataset(client, asked.name, plain_console(stderr=True))
     _emit(json, estimate=found, dataset=dataset, refused=refused)
     if not json:
         if refused:
             console.print(f"refused, so not in the dataset: {', '.join(refused)}", soft_wrap=True)
-        print_dataset(dataset, console)
+        reports.print_dataset(dataset, console)
         console.print(f"`graspd datasets status {asked.name}` shows each cell", style="dim")
     _check_success(dataset, asked=wait)
 
@@ -197,30 +185,30 @@ def estimate(
     hands: HandsOption = None,
     objects: ObjectsOption = None,
     spec: SpecOption = None,
-    url: UrlOption = None,
+    url: reports.UrlOption = None,
     json: JsonFlag = False,
     *,
     options: dict[str, Any],
 ) -> None:
     """Estimate the cost of a dataset: storage, and time and traffic for 1, 8 and 64 workers."""
     asked = dataset_plan(spec, name=None, hands=hands, objects=objects, options=options)
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         files, matrix = _matrix(client, asked)
         found = _estimate(client, matrix, files)
     if json:
         print_json(found)
     else:
-        print_estimate(found, plain_console())
+        reports.print_estimate(found, plain_console())
 
 
 @group.command("list", epilog="graspd datasets list")
 def list_datasets(
     limit: Annotated[int, typer.Option(min=1, max=200, help="Maximum number of datasets.")] = 20,
-    url: UrlOption = None,
+    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """List datasets, newest first."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         page = client.datasets(limit=limit)
     document = {"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next}
     rows = []
@@ -230,72 +218,72 @@ def list_datasets(
         rows.append((one.name, one.state, count(one.cells), *last))
     names = ("dataset", "state", "cells", "progress", "grasps", "size", "created")
     empty = "no dataset yet; `graspd datasets create NAME --hands allegro --objects mug,bottle` makes one"
-    print_rows(document, names, rows, whole=("state", "size", "created"), empty=empty, json=json)
+    reports.print_rows(document, names, rows, whole=("state", "size", "created"), empty=empty, json=json)
 
 
 @group.command(epilog="graspd datasets status kitchen --state failed")
 def status(
     name: NameArgument,
     state: Annotated[State | None, typer.Option(help="Only cells in this state.")] = None,
-    url: UrlOption = None,
+    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Show the matrix: state, yield and failures of each hand and object."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         dataset, cells = client.dataset(name), list(client.cells(name, state=state))
     if json:
         print_json({**dataset.model_dump(mode="json"), "matrix": [cell.model_dump(mode="json") for cell in cells]})
         return
-    print_dataset(dataset, plain_console())
-    print_cells(dataset, cells, plain_console())
+    reports.print_dataset(dataset, plain_console())
+    reports.print_cells(dataset, cells, plain_console())
 
 
 @group.command(epilog="graspd datasets cancel kitchen")
-def cancel(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+def cancel(name: NameArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
     """Cancel a dataset; its results remain."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         _show(client.cancel_dataset(name), json=json)
 
 
 @group.command(epilog="graspd datasets delete kitchen")
 def delete(
     name: NameArgument,
-    yes: YesOption = False,
+    yes: reports.YesOption = False,
     with_snapshots: Annotated[bool, typer.Option("--with-snapshots", help="Also delete its snapshots.")] = False,
-    url: UrlOption = None,
+    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Delete an ended dataset, and the jobs that belong to it alone."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         found = client.dataset(name)
         goes = f"{count(found.cells)} cell{'s' * (found.cells != 1)}, {count(found.grasps)} grasps"
         goes += f" ({size(found.size_bytes)})" + ", its snapshots" * with_snapshots
-        confirm(f"Delete dataset {name} with {goes}?", f"dataset {name}", yes=yes)
+        reports.confirm(f"Delete dataset {name} with {goes}?", f"dataset {name}", yes=yes)
         client.delete(request_path("datasets", name), with_snapshots=with_snapshots)
-    report_deletion("dataset", name, json=json, undo=f"graspd datasets restore {name}")
+    reports.report_deletion("dataset", name, json=json, undo=f"graspd datasets restore {name}")
 
 
 @group.command("restore", epilog="graspd datasets restore kitchen")
-def restore_dataset(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+def restore_dataset(name: NameArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
     """Restore a deleted dataset with its jobs and snapshots, within the grace time."""
-    restore(url, "dataset", name, json=json)
+    reports.restore(url, "dataset", name, json=json)
 
 
 @group.command(epilog="graspd datasets retry kitchen --wait")
-def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
+def retry(name: NameArgument, wait: WaitOption = False, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
     """Restart failed and cancelled jobs; existing results are reused."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         dataset = client.retry_dataset(name)
         if wait:
-            dataset = watch_dataset(client, name, plain_console(stderr=True))
+            dataset = reports.watch_dataset(client, name, plain_console(stderr=True))
     _show(dataset, json=json)
     _check_success(dataset, asked=wait)
 
 
 @group.command(epilog="graspd datasets snapshot kitchen")
-def snapshot(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+def snapshot(name: NameArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
     """Record the present shards of a dataset as an immutable list."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         taken = client.take_snapshot(name)
     whole = "complete" if taken.complete else "the dataset is not complete"
     grasps = f"{count(taken.grasps)} grasps of which {count(taken.valid)} are valid"
@@ -308,13 +296,13 @@ def export(
     name: NameArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; an interrupted export is continued.")],
     snapshot: Annotated[str | None, typer.Option(help="Digest of a snapshot; default: all present shards.")] = None,
-    url: UrlOption = None,
+    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Write a snapshot's files into a folder; each is verified against its checksum."""
     label, counts = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[files]}")
     columns = (label, BarColumn(), counts, DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         taken = client.snapshot(name, snapshot or client.take_snapshot(name).digest)
         console = plain_console(stderr=True)
         with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
@@ -379,7 +367,7 @@ def _show(dataset: DatasetView, *, json: bool) -> None:
     if json:
         print_json(dataset)
     else:
-        print_dataset(dataset, plain_console())
+        reports.print_dataset(dataset, plain_console())
 
 
 def _check_success(dataset: DatasetView, *, asked: bool) -> None:

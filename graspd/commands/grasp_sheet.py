@@ -10,16 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from graspd.exchange.robots.execution import (
-    STEP_S,
-    Executions,
-    RobotTrajectory,
-    build_executions,
-    straight_paths,
-    time_motions,
-    tool_frame,
-    velocity_limits,
-)
+from graspd.exchange.robots import execution
 from graspd.service.model.scene_spec import scene_supports
 from graspd.service.model.transforms import compose, invert
 from graspd.service.readers.trajectories import Waypoint, planned_scene_of, trajectory_of, wrist_angles
@@ -151,21 +142,21 @@ class GraspAnimation:
         seconds: list[float] = []
         for row in self.rows:
             found = self._execute(row)
-            limits, names = velocity_limits(found.hand), found.hand.joint_names
-            trajectory = time_motions(straight_paths(found, 0), names, limits.velocity, speed=SPEED)
+            limits, names = execution.velocity_limits(found.hand), found.hand.joint_names
+            trajectory = execution.time_motions(execution.straight_paths(found, 0), names, limits.velocity, speed=SPEED)
             pictures.append(self._render(row, waypoints(found, trajectory)))
-            shown = [STEP_S, *np.diff(trajectory.time).tolist()]
+            shown = [execution.STEP_S, *np.diff(trajectory.time).tolist()]
             shown[0] += BEFORE_S
             shown[-1] += AFTER_S
             seconds += shown
         return encode_animation(np.concatenate(pictures), seconds, suffix)
 
-    def _execute(self, row: np.intp) -> Executions:
+    def _execute(self, row: np.intp) -> execution.Executions:
         one, placed = np.array([row]), scenes_of_shard(self.shard)
         grasps = GraspSet.from_columns(self.shard.arrays).take(one)
         placed = None if placed is None else placed.take(one)
-        tool = tool_frame(None, self.hand.root_link, {})
-        return build_executions(self.hand, self.obj, grasps, rows=one, placed=placed, tool=tool, quality={})
+        tool = execution.tool_frame(None, self.hand.root_link, {})
+        return execution.build_executions(self.hand, self.obj, grasps, rows=one, placed=placed, tool=tool, quality={})
 
     def _render(self, row: np.intp, trajectory: Sequence[Waypoint]) -> NDArray[np.uint8]:
         width = self.width or WIDTH
@@ -177,7 +168,7 @@ class GraspAnimation:
         return np.asarray(sides[0])
 
 
-def waypoints(found: Executions, trajectory: RobotTrajectory) -> list[Waypoint]:
+def waypoints(found: execution.Executions, trajectory: execution.RobotTrajectory) -> list[Waypoint]:
     """Return the points of the first grasp's trajectory, in the frame of the object at rest."""
     poses = compose(invert(found.object_pose[0]), trajectory.hand_pose)
     held = trajectory.phase.index("lift")

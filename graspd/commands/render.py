@@ -36,17 +36,11 @@ from graspd.worker.files.provenance import (
     source_attributes,
 )
 from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, select_grasps
+from graspd.worker.rendering import sheets
 from graspd.worker.rendering.annotate import parse_channels
 from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, read_cameras
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.scenery import TABLE
-from graspd.worker.rendering.sheets import (
-    best_in_scenes,
-    best_rows,
-    best_transferred_rows,
-    reduce_to_palette,
-    views_page,
-)
 from graspd.worker.rendering.trajectory_pictures import animation_kind
 from graspd.worker.rendering.views import Extras
 from graspd.worker.rendering.views import render as render_views
@@ -119,7 +113,7 @@ def render(
     if page is not None:
         title = f"Views of {scene.attributes.get('object', 'the object')}"
         subtitle = f"{count} pictures, {size[0]} x {size[1]} pixels"
-        write_output(page, views_page(result, title=title, subtitle=subtitle))
+        write_output(page, sheets.views_page(result, title=title, subtitle=subtitle))
     told = {"file": str(output), "pictures": count, "seconds": round(seconds, 2), "device": used}
     print_result(told, f"{output}: {count} pictures, {seconds:.1f} s on {used}", json=json)
 
@@ -158,7 +152,7 @@ def pictures(
     if row:
         rows = _named_rows(base, row, chosen, word)
     else:
-        rows = best_rows(base.arrays, count or (1 if animate else 4 if trajectory else 12), chosen)
+        rows = sheets.best_rows(base.arrays, count or (1 if animate else 4 if trajectory else 12), chosen)
     among = int(chosen.sum())
     models = (hand_of_shard(base, hand), object_of_shard(base, object), rows)
     run = ExecutionContext(Device(device).resolve())
@@ -168,7 +162,7 @@ def pictures(
         kind: Kind = "trajectory" if trajectory else "three sides" if three else "one side"
         subtitle = f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}"
         page = GraspSheet(base, *models, kind, run, size).png(subtitle=subtitle)
-    write_output(output, reduce_to_palette(page) if palette and not animate else page)
+    write_output(output, sheets.reduce_to_palette(page) if palette and not animate else page)
     told = {"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()}
     print_result(told, f"{output}: {'' if row else 'the best '}{len(rows)} of {among} {word}", json=json)
 
@@ -194,7 +188,7 @@ def _load_scenes(path: Path) -> Shard:
 def _best_grasps(base: Shard, hand: str | None) -> DrawnHand | None:
     """Return the best valid grasp of each scene; of an unvalidated shard, the best feasible grasp."""
     validated = validity.valid_mask(base.arrays).any()
-    rows = best_in_scenes(base.arrays, validity.selection_mask(base.arrays, unvalidated=not validated))
+    rows = sheets.best_in_scenes(base.arrays, validity.selection_mask(base.arrays, unvalidated=not validated))
     if not len(base["grasp/hand_pose"]):
         return None
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
@@ -212,7 +206,7 @@ def _hand_in_pictures(scene: Shard, base_file: Path | None, hand: str | None) ->
     hand_of_shard(base, hand)
     if source.max() >= len(base["grasp/joint_positions"]):
         raise InputError(f"{base_file} has fewer grasps than its scenes refer to; give the base shard of these scenes")
-    rows = best_transferred_rows(scene.arrays, base.arrays)
+    rows = sheets.best_transferred_rows(scene.arrays, base.arrays)
     joints = np.asarray(base["grasp/joint_positions"], float)[source[rows]]
     poses = np.asarray(scene["grasp/hand_pose"], float)[rows]
     return DrawnHand(model, rows, poses, joints, wrist_angles(scene, rows))

@@ -11,16 +11,7 @@ import typer
 from graspd.service.cli import CommandGroup, JsonFlag, print_result, write_output
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import read_shard, write_shard
-from graspd.worker.files.provenance import (
-    INHERITED,
-    NEIGHBOUR_FACE_ERROR_M,
-    hand_of_shard,
-    id_of_columns,
-    neighbour_attributes,
-    object_of_shard,
-    source_attributes,
-    wrist_attributes,
-)
+from graspd.worker.files import provenance
 from graspd.worker.grasps import Posture
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.scenes.clearance import count_rejections, transfer_grasps
@@ -45,9 +36,9 @@ def scene(
     """Drop the object on a table and select the grasps that are clear there."""
     started = perf_counter()
     base = read_shard(grasps, kind="base")
-    model, obj = hand_of_shard(base, hand), object_of_shard(base, object)
+    model, obj = provenance.hand_of_shard(base, hand), provenance.object_of_shard(base, object)
     number = int(base.attributes.get("seed", 0)) if seed is None else seed  # type: ignore[arg-type]
-    others = [object_from_path(name, face_error_m=NEIGHBOUR_FACE_ERROR_M) for name in with_ or []]
+    others = [object_from_path(name, face_error_m=provenance.NEIGHBOUR_FACE_ERROR_M) for name in with_ or []]
     dropped = drop_together(obj, others, count=scenes, seed=number) if others else drop(obj, count=scenes, seed=number)
     result: dict[str, Any] = dict(dropped)
     poses = result["scene/object_pose"]
@@ -55,10 +46,12 @@ def scene(
     grasp, pregrasp = (Posture.from_columns(base.arrays, name) for name in ("grasp", "pregrasp"))
     result |= transfer_grasps(model, grasp, pregrasp, poses, neighbours)
     seconds = perf_counter() - started
-    attributes: dict[str, Attribute] = {key: base.attributes[key] for key in INHERITED if key in base.attributes}
+    attributes: dict[str, Attribute] = {
+        key: base.attributes[key] for key in provenance.INHERITED if key in base.attributes
+    }
     attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)}
-    attributes |= wrist_attributes(model) | neighbour_attributes(others, with_ or [])
-    attributes |= source_attributes(base) | {"shard_id": id_of_columns(result)}
+    attributes |= provenance.wrist_attributes(model) | provenance.neighbour_attributes(others, with_ or [])
+    attributes |= provenance.source_attributes(base) | {"shard_id": provenance.id_of_columns(result)}
     write_output(output, write_shard("scene", result, attributes))
     clear, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
     rolling = count_rolling_poses(obj, poses)

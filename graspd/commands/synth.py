@@ -11,16 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from graspd.service.cli import (
-    CommandGroup,
-    JsonFlag,
-    catch_stop_signals,
-    engine_settings,
-    fail,
-    plain_console,
-    print_result,
-    write_output,
-)
+from graspd.service import cli
 from graspd.service.command_options import parse_pairs, validate_options, with_options
 from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.local_options import LocalOptions
@@ -30,7 +21,7 @@ from graspd.service.store.shards import write_shard
 if TYPE_CHECKING:
     from graspd.worker.execution_context import Progress as Report
 
-app = CommandGroup()
+app = cli.CommandGroup()
 FEWER: Final = 3
 
 
@@ -41,7 +32,7 @@ def synth(
     object_: Annotated[str, typer.Option("--object", help="Mesh (STL, OBJ, PLY, GLB, OFF) or built-in object.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="HDF5 file to write.")],
     options: dict[str, Any],
-    json: JsonFlag = False,
+    json: cli.JsonFlag = False,
 ) -> None:
     """Generate, validate and measure grasps of one hand on one object as a job does; write an HDF5 file.
 
@@ -58,8 +49,8 @@ def synth(
     asked = validate_options(LocalOptions, options)
     if "payload" not in options and asked.scene_spec.kind != "free" and asked.validation != "none":
         asked = asked.model_copy(update={"payload": asked.mass is not None or asked.density is not None})
-    settings = engine_settings()
-    with catch_stop_signals() as stop, _progress_bar(quiet=json) as progress:
+    settings = cli.engine_settings()
+    with cli.catch_stop_signals() as stop, _progress_bar(quiet=json) as progress:
         try:
             made = synthesize_with_options(
                 hand,
@@ -72,13 +63,13 @@ def synth(
                 partial=True,
             )
         except TaskCancelled:
-            fail(f"interrupted before any grasp was validated: {out} is not written", 128 + stop[0])
+            cli.fail(f"interrupted before any grasp was validated: {out} is not written", 128 + stop[0])
         shard = write_shard("base", made.arrays, {**made.attributes, "shard_id": id_of_columns(made.arrays)})
-        write_output(out, shard)
+        cli.write_output(out, shard)
     found = {"file": str(out), **made.summary()}
-    print_result(found, _format_summary(found | ({"reason": None} if made.interrupted else {})), json=json)
+    cli.print_result(found, _format_summary(found | ({"reason": None} if made.interrupted else {})), json=json)
     if made.interrupted:
-        fail(f"interrupted: {out} contains {found['grasps']} of {asked.grasps} grasps", 128 + stop[0])
+        cli.fail(f"interrupted: {out} contains {found['grasps']} of {asked.grasps} grasps", 128 + stop[0])
     if made.reason is not None:
         raise typer.Exit(FEWER)
 
@@ -95,7 +86,7 @@ def _progress_bar(*, quiet: bool) -> Iterator[Report]:
     began = time.perf_counter()
     what, rate = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[rate]}")
     columns = (what, BarColumn(), rate, TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=plain_console(stderr=True), transient=True) as bar:
+    with Progress(*columns, console=cli.plain_console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None, rate="")
 
         def tell(done: float, total: float, message: str) -> None:

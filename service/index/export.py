@@ -1,7 +1,5 @@
 """Export of index tables as Parquet files, for DuckDB, pandas and others."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The index: all its parts on one database."""
 
-from __future__ import annotations
-
 from sqlalchemy import URL
 
 from graspd.service.index.changes.records import Changes, DatasetChanges, LiveChanges

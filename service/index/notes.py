@@ -1,7 +1,5 @@
 """Notes of the index: completeness, mark, service id, integrity scan, damaged stored objects."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final

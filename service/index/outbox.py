@@ -1,7 +1,5 @@
 """Outbox: numbered ends of jobs and datasets, webhooks, and deliveries of ends to webhooks."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

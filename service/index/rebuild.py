@@ -1,7 +1,5 @@
 """Rebuild of the index from the store, and differences between an index and the store."""
 
-from __future__ import annotations
-
 import logging
 import tempfile
 from collections.abc import Callable, Iterator
@@ -18,19 +16,8 @@ from graspd.service.index.index import Index
 from graspd.service.index.notes import StoreMark
 from graspd.service.index.outbox import last_end_number
 from graspd.service.index.tables import LIVE_COLUMNS, LIVE_TABLES, datasets, jobs, metadata, shards, webhooks
-from graspd.service.model import names
+from graspd.service.model import names, records
 from graspd.service.model.errors import DamagedError, InputError, NotFoundError
-from graspd.service.model.records import (
-    AttemptRecord,
-    DatasetEvent,
-    DatasetRecord,
-    JobEvent,
-    JobRecord,
-    ObjectSet,
-    Record,
-    Snapshot,
-    Tag,
-)
 from graspd.service.model.states import State
 from graspd.service.model.webhooks import Webhook
 from graspd.service.settings import sqlite_url
@@ -40,7 +27,7 @@ from graspd.service.store.records import newest_mark, parse_record, pending_dele
 from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
-RecordT = TypeVar("RecordT", bound=Record)
+RecordT = TypeVar("RecordT", bound=records.Record)
 #: Errors of an invalid record, when it is read or written to the database. An unavailable backend raises other errors.
 _OF_THE_RECORD: Final = (DamagedError, InputError, DataError, ValueError, TypeError, LookupError, ArithmeticError)
 _READERS: Final = 16
@@ -95,15 +82,15 @@ class _Rebuild:
         known = []
         for key, data in self._read_records(names.JOBS, lambda key: key.endswith("/job.json") and key.count("/") == 2):
             with self._skip_invalid(key, "jobs"):
-                record = parse_record(JobRecord, data, key)
+                record = parse_record(records.JobRecord, data, key)
                 self._index.write.add_job(record, within=self._connection)
                 known.append(record.id)
-        attempts = self._parse_records(AttemptRecord, names.TASKS)
+        attempts = self._parse_records(records.AttemptRecord, names.TASKS)
         for attempt in sorted(attempts, key=lambda attempt: attempt.number):
             with self._skip_invalid(names.attempt_key(attempt.task_id, attempt.number), "attempts"):
                 self._index.write.add_attempt(attempt, within=self._connection)
         for job in known:
-            if events := self._parse_records(JobEvent, names.job_events_folder(job)):
+            if events := self._parse_records(records.JobEvent, names.job_events_folder(job)):
                 self._index.write.set_job_events(job, events, within=self._connection)
 
     def add_shards(self) -> None:
@@ -114,19 +101,23 @@ class _Rebuild:
     def add_datasets(self) -> None:
         for key, data in self._read_records(names.DATASETS, lambda key: key.endswith("/dataset.json")):
             with self._skip_invalid(key, "datasets"):
-                record = parse_record(DatasetRecord, data, key)
+                record = parse_record(records.DatasetRecord, data, key)
                 self._index.write_dataset.add(record, within=self._connection)
-                if events := self._parse_records(DatasetEvent, names.dataset_events_folder(record.name)):
+                if events := self._parse_records(records.DatasetEvent, names.dataset_events_folder(record.name)):
                     self._index.write_dataset.set_events(record.name, events, within=self._connection)
         told = self._index.datasets.ended_event_counts(within=self._connection) | self._told
         for name, events in told.items():
             self._connection.execute(update(datasets).where(datasets.c.name == name).values(told=events))
         for key, data in self._read_records(names.DATASETS, lambda key: "/snapshots/" in key):
             with self._skip_invalid(key, "snapshots"):
-                self._index.write_dataset.add_snapshot(parse_record(Snapshot, data, key), within=self._connection)
+                self._index.write_dataset.add_snapshot(
+                    parse_record(records.Snapshot, data, key), within=self._connection
+                )
         for key, data in self._read_records(names.OBJECT_SETS):
             with self._skip_invalid(key, "object_sets"):
-                self._index.write_dataset.add_object_set(parse_record(ObjectSet, data, key), within=self._connection)
+                self._index.write_dataset.add_object_set(
+                    parse_record(records.ObjectSet, data, key), within=self._connection
+                )
 
     def add_webhooks(self) -> None:
         for key, data in self._read_records(names.WEBHOOKS):
@@ -139,7 +130,7 @@ class _Rebuild:
         last = {key.rpartition("/")[0]: (key, data) for key, data in sorted(self._read_records(names.TAGS))}
         for key, data in last.values():
             with self._skip_invalid(key):
-                self._index.tags.put(parse_record(Tag, data, key), within=self._connection)
+                self._index.tags.put(parse_record(records.Tag, data, key), within=self._connection)
 
     def _parse_records(self, model: type[RecordT], prefix: str) -> list[RecordT]:
         found = []

@@ -3,8 +3,6 @@
 Each change needs another `REVISION` in `database`, except for new metrics of grasps; a test enforces this.
 """
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 from sqlalchemy import JSON, BigInteger, Boolean, Column, Float, Index, Integer, MetaData, String, Table, Text, false

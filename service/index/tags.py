@@ -1,7 +1,5 @@
 """Tags: users' names for grasps, from records of the store."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 
 from sqlalchemy import Connection, case, delete, func, select, tuple_

@@ -1,7 +1,5 @@
 """Base class of the domain models, patterns of names, and texts of validation errors."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Wall-clock time as text. Durations and leases use `time.monotonic` instead."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime, timedelta
 
 

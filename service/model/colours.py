@@ -1,7 +1,5 @@
 """Conversion of sRGB and hexadecimal colours to linear RGB."""
 
-from __future__ import annotations
-
 Colour = tuple[float, float, float]
 
 

@@ -1,7 +1,5 @@
 """Regions of an object, cones of approach directions and wrist poses, as text."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """CPU cores and memory available to this process, by affinity and control groups."""
 
-from __future__ import annotations
-
 import math
 import os
 import time

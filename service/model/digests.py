@@ -1,7 +1,5 @@
 """Digests of inputs as ids of files, jobs and shards; repeated runs of a task write one shard."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable, Mapping

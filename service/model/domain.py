@@ -3,8 +3,6 @@
 Units are SI (metres, radians, kilograms, seconds). A pose is 7 numbers: position x y z, then unit quaternion w x y z.
 """
 
-from __future__ import annotations
-
 import re
 import zlib
 from collections.abc import Sequence

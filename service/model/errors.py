@@ -4,8 +4,6 @@ A message is one line that states the problem and the fix. `exit_code` and `stat
 statuses; `slug` names the problem type (RFC 9457). Messages and log lines never contain secrets, even in quoted texts.
 """
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Fidelities: named sets of a planner's settings."""
 
-from __future__ import annotations
-
 from typing import Final, Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """Names of grasp types that a job may require, and the numbers of the GRASP taxonomy."""
 
-from __future__ import annotations
-
 from typing import Final, Literal
 
 #: `any`: no requirement. `balanced`: the types of `BALANCED` in turn, one per batch. Types after `pinch` are those of

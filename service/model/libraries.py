@@ -3,8 +3,6 @@
 Garbage collections scan half a million objects of imported modules, and take half of the time of start and exit.
 """
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Options of grasps made in this process: job options with files instead of names, and run options."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal

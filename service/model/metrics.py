@@ -5,8 +5,6 @@ new metric needs a row here and a function (`MEASURES` in `worker.quality.table`
 shards lack it. A yes-or-no property of a grasp is a verdict, not a metric.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Keys of all objects that graspd writes to the store; ARCHITECTURE.md has a table."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 from functools import lru_cache

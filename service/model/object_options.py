@@ -1,7 +1,5 @@
 """Options of an object: the keys of its `asset.json`."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import AliasChoices, Field, model_validator

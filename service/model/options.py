@@ -1,7 +1,5 @@
 """Tables of options: command line, forms, Python signatures and docs derive from `option_rows`."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import re

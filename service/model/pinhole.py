@@ -1,7 +1,5 @@
 """Pinhole camera: pixels, rays and points. x right, y down, z forward; pixel centres at +0.5."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

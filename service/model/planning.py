@@ -4,8 +4,6 @@ A job is split into batches of `BATCH_SIZE` grasps. Each range of `JobRecord.spa
 stage: synthesize -> scene -> render, or for grasps planned in scenes: scene -> synthesize -> render.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Projects: groups of keys that share jobs, datasets, hands and objects, isolated from each other."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Final

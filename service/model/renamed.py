@@ -1,7 +1,5 @@
 """Conversion of the names of graspd 0.2, which all readers accept and tasks for old workers contain."""
 
-from __future__ import annotations
-
 import re
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """Scenes: a kind, or supports, neighbours and pose of the target. In the scene frame, z points up."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Sequence

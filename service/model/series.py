@@ -1,7 +1,5 @@
 """Definitions of all time series of `/metrics`, and names of the stored sums."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from typing import Final, Literal

@@ -1,7 +1,5 @@
 """States, stages, asset kinds and priorities."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 
 

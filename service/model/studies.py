@@ -1,7 +1,5 @@
 """Records of studies: stability maps; names of accuracies and speeds in charts."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from collections import defaultdict

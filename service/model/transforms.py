@@ -1,7 +1,5 @@
 """Rigid transforms in NumPy, with broadcasting. Pose (7,): position x y z, unit quaternion w x y z."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np
@@ -52,6 +50,12 @@ def quat_from_axis_angle(axis: Floats, angle: Floats) -> Floats:
     """Return the unit quaternion (..., 4) of a rotation by angle (...) [rad] about a unit axis (..., 3)."""
     half = 0.5 * np.asarray(angle, float)[..., None]
     return np.concatenate([np.cos(half), np.asarray(axis, float) * np.sin(half)], axis=-1)
+
+
+def quat_from_rpy(angles: Floats) -> Floats:
+    """Return the quaternion of roll, pitch and yaw (3,): rotations about the fixed axes x, then y, then z."""
+    x, y, z = quat_from_axis_angle(np.eye(3), angles)
+    return quat_multiply(z, quat_multiply(y, x))
 
 
 def slerp(a: Floats, b: Floats, share: float) -> Floats:

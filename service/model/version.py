@@ -1,7 +1,5 @@
 """Versions of the package, of task messages and of stages."""
 
-from __future__ import annotations
-
 from typing import Final
 
 PACKAGE_VERSION: Final = "0.2.0"

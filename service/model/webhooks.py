@@ -1,7 +1,5 @@
 """Webhooks: signed notifications to a URL when a job or dataset ends."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 from typing import Final, Literal

@@ -3,8 +3,6 @@
 A round indexes events and queues missing tasks. One controller leads, and the others wait (`service.pipeline.leading`).
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

@@ -6,8 +6,6 @@ stored objects below `removed/` and deletes that record. After the grace time it
 that no job needs. It can resume after a kill.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import time
@@ -27,22 +25,8 @@ from graspd.service.model.records import AttemptRecord, JobRecord, Record, Snaps
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline import job_actions, tagging
 from graspd.service.pipeline.backends import Services, record_transaction
+from graspd.service.store import records
 from graspd.service.store.library import load_asset, load_check
-from graspd.service.store.records import (
-    DeletedJob,
-    Deletion,
-    Put,
-    What,
-    dataset_events,
-    is_removed_before,
-    job_events,
-    load_dataset,
-    put_record,
-    read_record,
-    released_key,
-    removed_folder,
-    restorable_deletions,
-)
 from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
@@ -75,7 +59,7 @@ def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
     """Delete a job, and later the shards only it needs; ConflictError: unfinished or in a dataset."""
     job = services.index.jobs.get(job_id)
     try:
-        record = read_record(JobRecord, services.store, names.job_record_key(job_id))
+        record = records.read_record(JobRecord, services.store, names.job_record_key(job_id))
     except (NotFoundError, DamagedError):
         record = None  # The shards of an unreadable record are unknown, so they stay.
     with record_transaction(services) as (connection, put):
@@ -103,16 +87,18 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
         services.index.removals.remove_dataset(name, within=connection)
 
 
-def move_to_removed(services: Services, deletion: Deletion) -> None:
+def move_to_removed(services: Services, deletion: records.Deletion) -> None:
     """Move a deleted resource's stored objects below `removed/`, record last, unless it was restored."""
     record = _record_key(deletion)
     with services.index.database.write_transaction():
         if not services.store.exists(names.deletion_key(deletion.what, deletion.id)):
             return
-        folder = removed_folder(deletion)
-        put_record(services.store, f"{folder}/deletion.json", deletion)
+        folder = records.removed_folder(deletion)
+        records.put_record(services.store, f"{folder}/deletion.json", deletion)
         if deletion.job is not None:
-            put_record(services.store, released_key(deletion), DeletedJob(at=deletion.at, job=deletion.job))
+            records.put_record(
+                services.store, records.released_key(deletion), records.DeletedJob(at=deletion.at, job=deletion.job)
+            )
         attempts = [names.attempt_key(task, number) for task, number in deletion.attempts]
         for key in [*attempts, *_record_last(_keys_below(services.store, record.rpartition("/")[0]), record)]:
             services.store.move(key, f"{folder}/{key}")
@@ -121,18 +107,20 @@ def move_to_removed(services: Services, deletion: Deletion) -> None:
 
 def restore(
     services: Services,
-    what: What,
+    what: records.What,
     name: str,
     *,
-    permit: Callable[[Deletion], None],
-    among: Callable[[Deletion], bool] = lambda _: True,
-) -> Deletion:
+    permit: Callable[[records.Deletion], None],
+    among: Callable[[records.Deletion], bool] = lambda _: True,
+) -> records.Deletion:
     """Restore a deleted resource by name or id; a dataset is restored with its deleted jobs.
 
     `permit` raises if the user may not restore it; `among` tests the scope. NotFoundError: nothing of this name was
     deleted within the grace time. ConflictError: the name is in use again, or an asset that it needs is deleted.
     """
-    known = [one for one in restorable_deletions(services.store, what) if name in (one.id, one.name) and among(one)]
+    known = [
+        one for one in records.restorable_deletions(services.store, what) if name in (one.id, one.name) and among(one)
+    ]
     if not known:
         days = services.settings.shard_grace_s / 86400
         raise NotFoundError(f"no {what} {name!r} was deleted in the last {days:.3g} days")
@@ -146,9 +134,9 @@ def restore(
     return known[0]
 
 
-def _restore(services: Services, deletion: Deletion, connection: Connection) -> None:
+def _restore(services: Services, deletion: records.Deletion, connection: Connection) -> None:
     """Restore stored objects, then rows, then remove the deletion record; call within a write transaction."""
-    store, record, folder = services.store, _record_key(deletion), removed_folder(deletion)
+    store, record, folder = services.store, _record_key(deletion), records.removed_folder(deletion)
     waiting = names.deletion_key(deletion.what, deletion.id)
     if not store.exists(waiting) and store.exists(record):
         called = deletion.id if deletion.what in ("job", "dataset") else deletion.name
@@ -162,36 +150,36 @@ def _restore(services: Services, deletion: Deletion, connection: Connection) -> 
         _restore_rows(services, deletion, connection)
     except ConflictError:
         if not store.exists(waiting):
-            put_record(store, waiting, deletion)  # The garbage collector will move the objects again.
+            records.put_record(store, waiting, deletion)  # The garbage collector will move the objects again.
         raise
     store.delete(waiting)
     store.delete(f"{folder}/deletion.json")
 
 
-def _restore_rows(services: Services, deletion: Deletion, connection: Connection) -> None:
+def _restore_rows(services: Services, deletion: records.Deletion, connection: Connection) -> None:
     """Write the rows that follow from the records of a job, dataset, hand, object or network."""
     store, index = services.store, services.index
     if deletion.what == "job":
-        record = read_record(JobRecord, store, names.job_record_key(deletion.id))
+        record = records.read_record(JobRecord, store, names.job_record_key(deletion.id))
         _require_assets(services, record.assets, connection)
         index.write.add_job(record, within=connection)
-        tried = [read_record(AttemptRecord, store, names.attempt_key(*one)) for one in deletion.attempts]
+        tried = [records.read_record(AttemptRecord, store, names.attempt_key(*one)) for one in deletion.attempts]
         for attempt in sorted(tried, key=lambda one: one.number):
             index.write.add_attempt(attempt, within=connection)
-        if events := job_events(store, record.id):
+        if events := records.job_events(store, record.id):
             index.write.set_job_events(record.id, events, within=connection)
     elif deletion.what == "dataset":
-        dataset = load_dataset(store, deletion.id)
+        dataset = records.load_dataset(store, deletion.id)
         members = [(AssetKind.HAND, one.digest) for one in dataset.hands]
         _require_assets(services, [*members, *((AssetKind.OBJECT, one.digest) for one in dataset.objects)], connection)
         index.write_dataset.add(dataset, within=connection)
-        actions = dataset_events(store, dataset.name)
+        actions = records.dataset_events(store, dataset.name)
         index.write_dataset.set_events(dataset.name, actions, within=connection)
         # Only ended datasets are deleted: the end was reported before.
         told = max((action.number for action in actions), default=0)
         index.write_dataset.set_progress(dataset.name, told=told, within=connection)
         for key in _keys_below(store, names.dataset_snapshots_folder(dataset.name)):
-            index.write_dataset.add_snapshot(read_record(Snapshot, store, key), within=connection)
+            index.write_dataset.add_snapshot(records.read_record(Snapshot, store, key), within=connection)
     else:
         kind = AssetKind(deletion.what)
         asset = load_asset(store, kind, deletion.id)
@@ -202,11 +190,11 @@ def _restore_rows(services: Services, deletion: Deletion, connection: Connection
         index.write.add_asset(asset, load_check(store, kind, asset.digest), within=connection)
 
 
-def _restore_jobs(services: Services, deletion: Deletion, connection: Connection) -> None:
+def _restore_jobs(services: Services, deletion: records.Deletion, connection: Connection) -> None:
     """Restore the jobs of a dataset that were deleted with it or later."""
-    wanted = set(load_dataset(services.store, deletion.id).jobs)
-    newest: dict[str, Deletion] = {}
-    for one in restorable_deletions(services.store, "job"):
+    wanted = set(records.load_dataset(services.store, deletion.id).jobs)
+    newest: dict[str, records.Deletion] = {}
+    for one in records.restorable_deletions(services.store, "job"):
         if one.id in wanted and one.at >= deletion.at:
             newest.setdefault(one.id, one)
     for one in newest.values():
@@ -215,10 +203,10 @@ def _restore_jobs(services: Services, deletion: Deletion, connection: Connection
             _restore(services, one, connection)
 
 
-def _restore_tag(services: Services, deletion: Deletion) -> None:
-    folder = removed_folder(deletion)
+def _restore_tag(services: Services, deletion: records.Deletion) -> None:
+    folder = records.removed_folder(deletion)
     key = next(key for key in _keys_below(services.store, folder) if not key.endswith("/deletion.json"))
-    tagging.restore_tag(services, read_record(Tag, services.store, key))
+    tagging.restore_tag(services, records.read_record(Tag, services.store, key))
     for done in (key, f"{folder}/deletion.json"):
         services.store.delete(done)
 
@@ -229,7 +217,7 @@ def _require_assets(services: Services, wanted: Collection[tuple[AssetKind, str]
         raise ConflictError(f"it needs the {missing[0]}, which was deleted too; first run `graspd {kind}s restore`")
 
 
-def _record_key(deletion: Deletion) -> str:
+def _record_key(deletion: records.Deletion) -> str:
     """Return the key of the record whose presence makes the resource exist."""
     if deletion.what == "job":
         return names.job_record_key(deletion.id)
@@ -246,8 +234,8 @@ def _record_last(keys: Iterable[str], record: str) -> list[str]:
     return sorted(keys, key=lambda key: (key == record, key))
 
 
-def _put_deletion(put: Put, **values: Any) -> None:
-    deletion = Deletion(at=timestamp(), **values)
+def _put_deletion(put: records.Put, **values: Any) -> None:
+    deletion = records.Deletion(at=timestamp(), **values)
     put(names.deletion_key(deletion.what, deletion.id), deletion)
 
 
@@ -261,7 +249,7 @@ class GarbageCollector:
     def execute_deletions(self, budget_s: float = BUDGET_S) -> bool:
         """Execute deletions for about `budget_s` [s]; return whether work is left."""
         deadline = self._clock() + budget_s
-        for _, deletion in self._read_records(Deletion, names.DELETIONS):
+        for _, deletion in self._read_records(records.Deletion, names.DELETIONS):
             if self._clock() > deadline or not self._execute(deletion, deadline):
                 return True
             log.info("the stored objects of %s %s are moved to removed/", deletion.what, deletion.id)
@@ -276,12 +264,12 @@ class GarbageCollector:
         for key in sorted(removed, key=lambda key: key.endswith("/deletion.json")):
             if self._clock() > deadline:
                 return True
-            if is_removed_before(key, before):
+            if records.is_removed_before(key, before):
                 self._services.store.delete(key)
         known = self._services.index.notes.completeness()
         if known is not None and known.left_out:
             return False  # A job with an unreadable record may need one of these shards.
-        for key, released in self._read_records(DeletedJob, names.RELEASED):
+        for key, released in self._read_records(records.DeletedJob, names.RELEASED):
             if released.at > before:
                 break  # The keys begin with the time, so all further records are younger.
             for stage, shard in self._unneeded_shards(released):
@@ -295,11 +283,11 @@ class GarbageCollector:
         """Yield key and content of the readable records below a folder, ordered by key."""
         for key in sorted(entry.key for entry in self._services.store.list(folder)):
             try:
-                yield key, read_record(model, self._services.store, key)
+                yield key, records.read_record(model, self._services.store, key)
             except DamagedError as error:
                 log.warning("%s", error)
 
-    def _execute(self, deletion: Deletion, deadline: float) -> bool:
+    def _execute(self, deletion: records.Deletion, deadline: float) -> bool:
         """Remove rows and move stored objects of a deleted resource; return whether all is done."""
         with self._services.index.database.write_transaction() as connection:
             if not self._services.store.exists(names.deletion_key(deletion.what, deletion.id)):
@@ -319,7 +307,7 @@ class GarbageCollector:
     def _remove_jobs_of(self, dataset: str, deadline: float) -> bool:
         """Delete jobs planned for this dataset that are in no other; return whether all are deleted."""
         try:
-            jobs = load_dataset(self._services.store, dataset).jobs
+            jobs = records.load_dataset(self._services.store, dataset).jobs
         except (NotFoundError, DamagedError):
             return True
         for some in chunks(jobs, _AT_ONCE):
@@ -335,7 +323,7 @@ class GarbageCollector:
                     log.info("job %s of the deleted dataset %s stays: %s", job, dataset, error)
         return True
 
-    def _unneeded_shards(self, released: DeletedJob) -> Iterator[tuple[Stage, str]]:
+    def _unneeded_shards(self, released: records.DeletedJob) -> Iterator[tuple[Stage, str]]:
         planned = [(task.stage, task.output) for task in plan_tasks(released.job)]
         for some in chunks(planned, _AT_ONCE):
             unneeded = self._services.index.removals.unneeded_shards([shard for _, shard in some])

@@ -1,7 +1,5 @@
 """Choice of the cheapest fidelity that reaches a required accuracy in the stored charts."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Application of events to the index. An event only names its data, which is read from the store."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import OrderedDict, defaultdict

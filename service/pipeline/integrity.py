@@ -3,8 +3,6 @@
 The check changes nothing. The scan has a limited rate and can resume. A repair makes damaged shards again.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import heapq
@@ -18,22 +16,12 @@ from dataclasses import replace
 from typing import Any, Final
 
 from graspd.service.index.notes import Damage, ScanNote
-from graspd.service.model import names
+from graspd.service.model import names, records
 from graspd.service.model.clock import age_of, timestamp
 from graspd.service.model.digests import digest_files
 from graspd.service.model.domain import Asset
 from graspd.service.model.errors import DamagedError, GraspdError, InputError, NotFoundError
 from graspd.service.model.planning import PlannedTask, create_task_message, plan_tasks
-from graspd.service.model.records import (
-    AttemptRecord,
-    DatasetEvent,
-    DatasetRecord,
-    JobEvent,
-    JobRecord,
-    ObjectSet,
-    Snapshot,
-    Tag,
-)
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.model.webhooks import Webhook
@@ -72,17 +60,17 @@ _OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)
 #: Key patterns of records, and the model of each.
 _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"assets/[^/]+/[^/]+/asset\.json", Asset),
-    (r"jobs/[^/]+/job\.json", JobRecord),
-    (r"jobs/[^/]+/events/[^/]+\.json", JobEvent),
-    (r"tasks/[^/]+/attempts/[^/]+\.json", AttemptRecord),
-    (r"datasets/[^/]+/dataset\.json", DatasetRecord),
-    (r"datasets/[^/]+/events/[^/]+\.json", DatasetEvent),
-    (r"datasets/[^/]+/snapshots/[^/]+\.json", Snapshot),
-    (r"object_sets/[^/]+/[^/]+\.json", ObjectSet),
+    (r"jobs/[^/]+/job\.json", records.JobRecord),
+    (r"jobs/[^/]+/events/[^/]+\.json", records.JobEvent),
+    (r"tasks/[^/]+/attempts/[^/]+\.json", records.AttemptRecord),
+    (r"datasets/[^/]+/dataset\.json", records.DatasetRecord),
+    (r"datasets/[^/]+/events/[^/]+\.json", records.DatasetEvent),
+    (r"datasets/[^/]+/snapshots/[^/]+\.json", records.Snapshot),
+    (r"object_sets/[^/]+/[^/]+\.json", records.ObjectSet),
     (r"deletions/[^/]+/[^/]+\.json", Deletion),
     (r"released/[^/]+\.json", DeletedJob),
     (r"webhooks/[^/]+\.json", Webhook),
-    (r"tags/[^/]+/[^/]+\.json", Tag),
+    (r"tags/[^/]+/[^/]+\.json", records.Tag),
 )
 #: Folders in the order of a scan, which stores its position.
 FOLDERS: Final = (
@@ -391,13 +379,13 @@ def _matches_index(services: Services, shard: str, file: str) -> bool:
         return False
 
 
-def _task_of_shard(services: Services, stage: Stage, shard: str) -> tuple[JobRecord, PlannedTask] | str:
+def _task_of_shard(services: Services, stage: Stage, shard: str) -> tuple[records.JobRecord, PlannedTask] | str:
     """Return job and task that make a shard, or why no task can make it."""
     job = services.index.shards.job_of(shard)
     if job is None:
         return "no job makes it, so it cannot be made again; put a copy in its place"
     try:
-        record = read_record(JobRecord, services.store, names.job_record_key(job))
+        record = read_record(records.JobRecord, services.store, names.job_record_key(job))
     except (NotFoundError, DamagedError) as error:
         return f"the job that makes it cannot be read: {error}"
     if (made := record.revisions.get(stage)) != STAGE_REVISIONS[stage]:

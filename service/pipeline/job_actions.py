@@ -1,7 +1,5 @@
 """Actions of users on jobs (submit, cancel, retry), checks of assets, division of jobs into tasks."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time

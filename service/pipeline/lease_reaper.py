@@ -1,7 +1,5 @@
 """Recovery of tasks whose worker is lost, and of tasks that the queue lost."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Collection

@@ -1,7 +1,5 @@
 """Changes of tags: each writes the record, then the rows, within one write transaction of the index."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 
 from graspd.service.model import names
@@ -9,14 +7,7 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError, LimitError, NotFoundError
 from graspd.service.model.records import MOST_TAGGED, Grasp, Tag, rows_by_shard, tag_id
 from graspd.service.pipeline.backends import Services, record_transaction
-from graspd.service.store.records import (
-    Deletion,
-    delete_older_tag_versions,
-    newest_tag_version,
-    put_record,
-    put_tag_version,
-    removed_folder,
-)
+from graspd.service.store import records
 
 #: Called with the tag to change, None for a new one; raises if the change is not allowed.
 Permit = Callable[[Tag | None], None]
@@ -54,10 +45,10 @@ def delete_tag(services: Services, tag: str, *, permit: Permit, owner: str = "")
 
     def mark_deleted(one: Tag) -> Tag:
         said = {"name": one.name, "submitter": one.owner, "project": one.project}
-        deletion = Deletion(what="tag", id=one.id, at=timestamp(), owner=owner, **said)
-        folder = removed_folder(deletion)
-        put_record(services.store, f"{folder}/{names.tag_version_key(one.id, one.number)}", one)
-        put_record(services.store, f"{folder}/deletion.json", deletion)
+        deletion = records.Deletion(what="tag", id=one.id, at=timestamp(), owner=owner, **said)
+        folder = records.removed_folder(deletion)
+        records.put_record(services.store, f"{folder}/{names.tag_version_key(one.id, one.number)}", one)
+        records.put_record(services.store, f"{folder}/deletion.json", deletion)
         return one.model_copy(update={"grasps": {}, "gone": True})
 
     _change_tag(services, tag, mark_deleted, permit)
@@ -78,7 +69,7 @@ def _change_tag(
 ) -> tuple[Tag, Tag]:
     """Change a tag, or the new tag `fresh`; return it before and after; NotFoundError without either."""
     with record_transaction(services) as (connection, put):
-        found = newest_tag_version(services.store, tag)
+        found = records.newest_tag_version(services.store, tag)
         known = None if found is None or found.gone else found
         if known is None and fresh is None:
             raise NotFoundError(f"there is no tag {tag!r}")
@@ -88,10 +79,10 @@ def _change_tag(
         after = change(before).model_copy(update={"number": found.number + 1 if found else 1, "changed": timestamp()})
         is_changed = known is None or after.members != before.members or after.gone
         if is_changed:
-            put_tag_version(put, after)
+            records.put_tag_version(put, after)
             services.index.tags.put(after, within=connection)
     if is_changed:
         # Older versions are deleted after the commit, while no other process can read the last version.
         with services.index.database.write_transaction():
-            delete_older_tag_versions(services.store, after)
+            records.delete_older_tag_versions(services.store, after)
     return before, after

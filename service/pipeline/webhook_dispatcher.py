@@ -4,8 +4,6 @@ Each webhook has one delivery at a time; a failed one delays the others. Project
 least recently used webhook comes first. Webhooks whose last delivery failed share half of the slots.
 """
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import ipaddress

@@ -1,7 +1,5 @@
 """Connections to Redis, whose URL is configured or belongs to the data folder's embedded server."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import tempfile

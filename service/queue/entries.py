@@ -9,8 +9,6 @@ some workers can do waits in a separate list. The name of this list ends in the 
 means schema 2 and revision 10. RQ's readers modify data, so read-only code reads RQ's keys directly.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import zlib

@@ -1,7 +1,5 @@
 """Types of the queue: events, leases, status. `rq_queue` implements the queue."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum

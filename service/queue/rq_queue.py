@@ -4,8 +4,6 @@ Each pair of priority and stage has an RQ queue. RQ's retries, scheduler, mainte
 because they may lose or repeat tasks.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections import Counter

@@ -20,8 +20,6 @@ answers in librealsense issues 999 and 3904; Microsoft, Azure Kinect DK depth ca
 Evaluation of the Azure Kinect (Sensors 21), with the values used by BlenderProc.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """Grasps of base shards, one by one or as arrays."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final

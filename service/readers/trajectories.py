@@ -1,7 +1,5 @@
 """Trajectories of grasps in base shards: postures from standoff or pregrasp to squeeze or lift."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Filter expressions (`service.model.where`) evaluated on base shards."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import reduce
 from operator import and_, eq, ge, gt, le, lt, ne, or_

@@ -4,8 +4,6 @@ The record of the URL names its writer, and is ignored after a crash of that pro
 private to its user and meant for a shared folder of a cluster. The end of the service removes the file.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

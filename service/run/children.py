@@ -1,7 +1,5 @@
 """Child processes of a supervisor: start, restart with back-off, stop."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging

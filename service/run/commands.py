@@ -1,7 +1,5 @@
 """Commands `graspd up`, `graspd controller` and `graspd admin index`."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal
@@ -13,17 +11,7 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import (
-    CommandGroup,
-    DataDir,
-    JsonFlag,
-    load_settings,
-    log_to_stderr,
-    plain_console,
-    print_json,
-    print_result,
-    restrict_file_access,
-)
+from graspd.service import cli
 from graspd.service.model import names
 from graspd.service.model.errors import IndexDamaged, QueueUnavailable, UnavailableError, without_secrets
 from graspd.service.settings import Settings
@@ -31,8 +19,8 @@ from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
 
-app = CommandGroup(no_args_is_help=True)
-index_app = CommandGroup(no_args_is_help=True, help="Rebuild the index from the store or export its tables.")
+app = cli.CommandGroup(no_args_is_help=True)
+index_app = cli.CommandGroup(no_args_is_help=True, help="Rebuild the index from the store or export its tables.")
 app.add_typer(index_app, name="index")
 
 
@@ -51,8 +39,8 @@ def up(
     redis_port: Annotated[
         int, typer.Option(min=0, max=65535, help="With --share: port of Redis for other machines; 0: any free port.")
     ] = 0,
-    data_dir: DataDir = None,
-    json: JsonFlag = False,
+    data_dir: cli.DataDir = None,
+    json: cli.JsonFlag = False,
 ) -> None:
     """Run the whole service on this machine until Ctrl-C."""
     if any(find_spec(library) is None for library in ("httpx", "fastapi", *(("warp",) if workers else ()))):
@@ -60,11 +48,11 @@ def up(
     from graspd.service.run.address import new_listen_address
     from graspd.service.run.supervisor import Supervisor
 
-    settings = load_settings(host=host, port=port, device=device, data_dir=data_dir)
-    log_to_stderr(settings, "up")
-    restrict_file_access(settings)
+    settings = cli.load_settings(host=host, port=port, device=device, data_dir=data_dir)
+    cli.log_to_stderr(settings, "up")
+    cli.restrict_file_access(settings)
     stop = stop_on_signals()
-    console = plain_console(stderr=True)
+    console = cli.plain_console(stderr=True)
     others = new_listen_address(settings, share, host=share_host, port=redis_port) if share is not None else None
     supervisor = Supervisor(settings, workers=workers, joining=others)
     supervisor.start()
@@ -73,7 +61,7 @@ def up(
             where = f"{supervisor.api_url} (data in {supervisor.settings.data_dir})"
             console.print(f"graspd is up: {where}; Ctrl-C stops it", soft_wrap=True)
             if json:
-                print_json({"api_url": supervisor.api_url, "pid": os.getpid(), "processes": supervisor.pids})
+                cli.print_json({"api_url": supervisor.api_url, "pid": os.getpid(), "processes": supervisor.pids})
             stop.wait()
         console.print("stopping ...")
     finally:
@@ -83,12 +71,12 @@ def up(
 @app.command(epilog="graspd controller")
 def controller(
     check: Annotated[bool, typer.Option("--check", help="Only check for a controller; exit code 1: none.")] = False,
-    data_dir: DataDir = None,
+    data_dir: cli.DataDir = None,
 ) -> None:
     """Run a controller (retries, index), which leads or stands by. `graspd up` starts one."""
-    settings = load_settings(data_dir=data_dir)
-    log_to_stderr(settings, "controller")
-    restrict_file_access(settings)
+    settings = cli.load_settings(data_dir=data_dir)
+    cli.log_to_stderr(settings, "controller")
+    cli.restrict_file_access(settings)
     if check:
         from graspd.service.pipeline.leading import PART
         from graspd.service.queue.rq_queue import open_queue
@@ -137,8 +125,8 @@ def _check_identity(settings: Settings, stop: threading.Event, alive: HeartbeatF
 @index_app.command(epilog="graspd admin index rebuild --check")
 def rebuild(
     check: Annotated[bool, typer.Option("--check", help="Print differences without changing anything.")] = False,
-    data_dir: DataDir = None,
-    json: JsonFlag = False,
+    data_dir: cli.DataDir = None,
+    json: cli.JsonFlag = False,
 ) -> None:
     """Rebuild the index from the store with this version's tables; this service then owns the store.
 
@@ -152,7 +140,7 @@ def rebuild(
     from graspd.service.pipeline.integrity import scan
     from graspd.service.store.packs import convert_packs
 
-    settings = load_settings(data_dir=data_dir)
+    settings = cli.load_settings(data_dir=data_dir)
     if check:
         read_condition(settings.resolved_index_url)  # An open index moves a damaged file aside.
     services = Services.open(settings, patience=0, make=False, anew=not check)
@@ -173,7 +161,7 @@ def rebuild(
     except IndexDamaged:
         found, counts = ["the index file was damaged and is replaced"], {} if check else make()
     if json:
-        print_json({"differences": found, "changed": bool(found) and not check, **counts})
+        cli.print_json({"differences": found, "changed": bool(found) and not check, **counts})
     else:
         for line in found:
             typer.echo(line)
@@ -186,24 +174,26 @@ def rebuild(
 @index_app.command(epilog="graspd admin index export -o tables")
 def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write, with a file for each table.")],
-    data_dir: DataDir = None,
-    json: JsonFlag = False,
+    data_dir: cli.DataDir = None,
+    json: cli.JsonFlag = False,
 ) -> None:
     """Write grasps, shards, jobs, tasks, assets, datasets and usage as Parquet for DuckDB or pandas."""
     from graspd.service.index.export import export as write
     from graspd.service.index.index import Index
 
-    with closing(Index(load_settings(data_dir=data_dir).resolved_index_url)) as index:
+    with closing(Index(cli.load_settings(data_dir=data_dir).resolved_index_url)) as index:
         rows = write(index.database, output)
-    print_result(rows, "\n".join(f"{output / name}.parquet  {count} rows" for name, count in rows.items()), json=json)
+    cli.print_result(
+        rows, "\n".join(f"{output / name}.parquet  {count} rows" for name, count in rows.items()), json=json
+    )
 
 
 @index_app.command(epilog="graspd admin index path")
-def path(data_dir: DataDir = None) -> None:
+def path(data_dir: cli.DataDir = None) -> None:
     """Print the location of the index, without the password of its URL."""
     from sqlalchemy import make_url
 
-    url = make_url(load_settings(data_dir=data_dir).resolved_index_url)
+    url = make_url(cli.load_settings(data_dir=data_dir).resolved_index_url)
     typer.echo(without_secrets(url.render_as_string(hide_password=True)))
 
 

@@ -1,7 +1,5 @@
 """Embedded Redis of `graspd up`: server program, private unix socket, append-only log on disk."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import importlib.util

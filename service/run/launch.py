@@ -3,8 +3,6 @@
 On Linux, the kernel kills the child (prctl survives exec); elsewhere the next `graspd up` does, by its pid file.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal

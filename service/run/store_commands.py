@@ -1,7 +1,5 @@
 """Commands `graspd admin store`: check, repair and conversion of the store."""
 
-from __future__ import annotations
-
 import time
 from typing import Annotated, Final
 

@@ -1,7 +1,5 @@
 """`graspd up`: Redis, API, controller and workers as child processes of one parent."""
 
-from __future__ import annotations
-
 import json
 import logging
 import secrets

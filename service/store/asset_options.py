@@ -1,7 +1,5 @@
 """Command-line options of a hand or an object, and their values as keys of its `asset.json`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Annotated, Any, Final

@@ -1,7 +1,5 @@
 """Text of the check of an asset: verdict, sizes and guessed values."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any

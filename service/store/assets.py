@@ -1,7 +1,5 @@
 """Files of hands and objects: reproducible ZIPs (sorted names, fixed times), and built-in files."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import shutil

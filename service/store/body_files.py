@@ -1,6 +1,4 @@
-"""Objects given as a URDF, SDF or MJCF: the description among an object's files, and the files to which it refers."""
-
-from __future__ import annotations
+"""URDF, SDF or MJCF of an object: the description among its files, and the files that it names."""
 
 import posixpath
 from collections.abc import Mapping
@@ -24,13 +22,13 @@ def is_body(name: str, data: bytes) -> bool:
 
 
 def find_body(files: Mapping[str, bytes]) -> str:
-    """Return the only description of an object, which takes precedence over its meshes; "" unless there is one."""
+    """Return the only description of an object, which precedes its meshes; "" unless there is one."""
     found = [name for name in files if name.lower().endswith(SUFFIXES) and is_body(name, files[name])]
     return found[0] if len(found) == 1 else ""
 
 
 def referenced_files(files: Mapping[str, bytes], main: str) -> dict[str, bytes]:
-    """Return the description `main`, and the meshes and descriptions that it names, by their names in `files`."""
+    """Return the description `main`, and the meshes and descriptions that it names, by name."""
     found, waiting = {main: files[main]}, [main]
     while waiting:
         text, base = decode_text(files[waiting.pop()]), posixpath.dirname(main)

@@ -1,7 +1,5 @@
 """HDF5 schema of shards: shape, unit and meaning of datasets; type and meaning of root attributes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal

@@ -1,7 +1,5 @@
 """`asset.json`, a small JSON object in an asset, and corrections of guessed values of a hand."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

@@ -1,7 +1,5 @@
 """Files of a hand on the user's disk: selection, main file and format."""
 
-from __future__ import annotations
-
 import json
 import posixpath
 import re
@@ -13,16 +11,8 @@ from pathlib import Path, PurePosixPath
 from typing import Final, Literal
 
 from graspd.service.model.errors import InputError, LimitError
-from graspd.service.store import usd_layers
+from graspd.service.store import mesh_files, usd_layers
 from graspd.service.store.assets import MAX_FILES, ZipFiles
-from graspd.service.store.mesh_files import (
-    HEAD_BYTES,
-    MESHES,
-    file_references,
-    match_name,
-    resolve_appearance_file,
-    resolve_mesh_reference,
-)
 
 #: Names of a file that describes the hand besides its URDF; the first name takes precedence.
 DESCRIPTIONS: Final = ("asset.json", "hand.json")
@@ -49,13 +39,13 @@ def find_hand_files(path: Path) -> tuple[dict[str, Path], str]:
 
 def _appearance_files(files: Mapping[str, Path], root: Path) -> dict[str, Path]:
     found: dict[str, Path] = {}
-    waiting = [name for name in files if name.lower().endswith(MESHES)]
+    waiting = [name for name in files if name.lower().endswith(mesh_files.MESHES)]
     while waiting and len(files) + len(found) < MAX_FILES:
         mesh = waiting.pop()
         with (root / mesh).open("rb") as file:
-            head = file.read(HEAD_BYTES)
-        for reference in file_references(mesh, head):
-            name = resolve_appearance_file(mesh, reference, lambda one: _is_inside(root / one, root))
+            head = file.read(mesh_files.HEAD_BYTES)
+        for reference in mesh_files.file_references(mesh, head):
+            name = mesh_files.resolve_appearance_file(mesh, reference, lambda one: _is_inside(root / one, root))
             if name and name not in files and name not in found:
                 found[name] = root / name
                 waiting += [name] if name.lower().endswith(".mtl") else []
@@ -128,7 +118,7 @@ def _referenced_files(path: Path, root: Path) -> set[str]:
 
 def _resolve_names(written: str, base: str, folder: str, root: Path) -> Iterator[str]:
     with suppress(InputError):
-        reference = resolve_mesh_reference(posixpath.join(folder, written), base)
+        reference = mesh_files.resolve_mesh_reference(posixpath.join(folder, written), base)
         if not reference.scheme or not folder:
             for name in reference.names:
                 if there := _actual_name(name, root):
@@ -143,7 +133,7 @@ def _actual_name(name: str, root: Path) -> str:
     for part in PurePosixPath(name).parts:
         entry = part if (at / part).exists() else ""
         with suppress(OSError):
-            entry = entry or match_name(part, [other.name for other in at.iterdir()])
+            entry = entry or mesh_files.match_name(part, [other.name for other in at.iterdir()])
         if not entry:
             return ""
         at /= entry

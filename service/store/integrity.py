@@ -5,8 +5,6 @@ A seal is the SHA-256 of an object, computed with zeros in place of the seal's 6
 have no seal and are not checked.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

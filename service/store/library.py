@@ -1,7 +1,5 @@
 """Library of hands and objects in the store: publishing, loading, names."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import tempfile

@@ -1,7 +1,5 @@
 """Resolution of mesh file names in descriptions, and of the texture and material files of meshes."""
 
-from __future__ import annotations
-
 import posixpath
 import re
 from collections.abc import Callable, Iterable, Mapping

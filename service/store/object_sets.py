@@ -1,6 +1,4 @@
-"""Sets of objects from a folder or ZIP of meshes or descriptions; the layouts of YCB and EGAD are detected."""
-
-from __future__ import annotations
+"""Sets of objects from a folder or ZIP of meshes or descriptions, also laid out as YCB or EGAD."""
 
 import posixpath
 import re

@@ -4,8 +4,6 @@ A pack has a head (magic bytes and length of the directory), the directory, mani
 of its directory, which has the SHA-256 of each manifest and file. Other records list the deleted shards of a pack.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

@@ -4,8 +4,6 @@ The key of a study is `{kind}/{created}.json`, with kind `charts` or `scene_char
 `stability` for `graspd stability`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Reading and writing of shards as HDF5 files; `columns` has the schema."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -3,8 +3,6 @@
 Operations are put if absent, get, range, list, move and delete; compare-and-swap is not needed.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os

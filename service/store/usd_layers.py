@@ -1,7 +1,5 @@
 """Files of a USD stage: the root layer and all layers that it composes, inside one folder."""
 
-from __future__ import annotations
-
 import posixpath
 from pathlib import Path
 from typing import Any, Final
@@ -21,7 +19,7 @@ def import_usd(error: type[InputError] = InputError) -> None:
 
 
 def layer_files(path: Path) -> dict[str, Path]:
-    """Return the layers of a stage by name relative to its folder, `path` first; the errors of `open_layers`."""
+    """Return the layers of a stage by relative name, `path` first; the errors of `open_layers`."""
     if path.suffix.lower() == SUFFIXES[3]:  # a package
         return {path.name: path}
     import_usd()
@@ -29,7 +27,7 @@ def layer_files(path: Path) -> dict[str, Path]:
 
 
 def open_layers(root: Path, main: str) -> dict[str, Any]:
-    """Open `main` and the layers that it refers to, by name relative to the folder `root`, without composing them.
+    """Open `main` and the layers that it names, by name relative to `root`, without composing them.
     Missing layers are left out: the variant that needs them may not be selected.
     Raises InputError: a layer is unreadable, or names one outside the folder."""
     from pxr import Sdf, Tf

@@ -4,8 +4,6 @@
 valid grasps, even if its column `quality/valid` marks feasible grasps (graspd 0.1).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Final
 

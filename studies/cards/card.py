@@ -1,7 +1,5 @@
 """A card in a folder: README.md, card.json, checksums.sha256, plots, and sample pictures."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Input of a card: the shards of a snapshot or folder, read one by one without pictures."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor

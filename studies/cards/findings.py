@@ -1,7 +1,5 @@
 """Findings in a dataset's figures: biases, gaps and failures that matter for training."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from statistics import median_high
 from typing import Any, Final

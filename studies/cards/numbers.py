@@ -1,7 +1,5 @@
 """Content of `card.json`, computed from the shards; None stands for unknown values."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A card as a page: `README.md` with a YAML head for dataset hubs, from the template `page.md.j2`."""
 
-from __future__ import annotations
-
 import json
 from bisect import bisect_right
 from collections.abc import Mapping

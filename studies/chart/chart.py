@@ -1,7 +1,5 @@
 """Run of a chart: all settings of the command line on all pairs, with interleaved repeats."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A chart as JSON, CSV, Markdown and plots."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Mapping, Sequence

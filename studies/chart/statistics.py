@@ -1,7 +1,5 @@
 """Figures of runs with error bars, their summary over pairs, and the Pareto front."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 

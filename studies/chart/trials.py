@@ -1,7 +1,5 @@
 """Settings of a chart, and their repeated, validated runs on a hand and an object."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -2,8 +2,6 @@
 
 All are prepared like uploads. The hands have equal three-joint fingers in a ring, which lean outward when open."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -3,8 +3,6 @@
 Amounts of error range from those of `--robust` (`worker.validation.variant`) to amounts at which few grasps hold.
 Displacements and rotations of each grasp have their own direction."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Failure maps as JSON, Markdown and plots."""
 
-from __future__ import annotations
-
 import json
 import math
 import textwrap
@@ -9,15 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from graspd.service.model.studies import (
-    OUTCOMES,
-    MapCell,
-    Stability,
-    StabilityMap,
-    count_outcomes,
-    format_tick,
-    tick_position,
-)
+from graspd.service.model import studies
 from graspd.studies.figures import markdown_table, new_figure
 
 #: Colours (fill, text) by outcome, distinguishable by lightness alone.
@@ -33,7 +23,7 @@ _FONT_SIZES: Final = (7.0, 6.0, 5.0)
 _TICK_LETTERS: Final = 14  # tick labels are wrapped at this number of characters
 
 
-def write(found: Stability, folder: Path) -> list[Path]:
+def write(found: studies.Stability, folder: Path) -> list[Path]:
     """Write `stability.json`, `stability.md` and a plot of each map; return the files."""
     folder.mkdir(parents=True, exist_ok=True)
     written = [folder / "stability.json", folder / "stability.md"]
@@ -45,7 +35,7 @@ def write(found: Stability, folder: Path) -> list[Path]:
     return written
 
 
-def markdown(found: Stability) -> str:
+def markdown(found: studies.Stability) -> str:
     """Return a page in Markdown: remaining failures, then each map with symptom, guard and test."""
     said = ", ".join(f"{name} {value}" for name, value in found.versions.items())
     lines = ["# Failure maps", "", f"`{found.command}`; {said}.", "", *_unguarded_failures(found.maps)]
@@ -61,7 +51,7 @@ def markdown(found: Stability) -> str:
     return "\n".join(lines)
 
 
-def _unguarded_failures(maps: Sequence[StabilityMap]) -> list[str]:
+def _unguarded_failures(maps: Sequence[studies.StabilityMap]) -> list[str]:
     """Return a section with counts of the cells that a job can reach, and with broken ones among them."""
     lines = ["## What still breaks", ""]
     lines += ["Counts of cells that a job can reach. Other cells need settings that jobs do not have."]
@@ -75,11 +65,11 @@ def _unguarded_failures(maps: Sequence[StabilityMap]) -> list[str]:
     return [*lines, ""]
 
 
-def _counts(cells: Sequence[MapCell]) -> list[str]:
-    return list(map(str, count_outcomes(cells).values()))
+def _counts(cells: Sequence[studies.MapCell]) -> list[str]:
+    return list(map(str, studies.count_outcomes(cells).values()))
 
 
-def draw(one: StabilityMap, path: Path) -> None:
+def draw(one: studies.StabilityMap, path: Path) -> None:
     """Plot a map with a square per cell."""
     from matplotlib.patches import Patch
 
@@ -94,8 +84,8 @@ def draw(one: StabilityMap, path: Path) -> None:
         _panel(axes, one, panel)
     for axes in list(grid.flat)[len(panels) :]:
         axes.set_visible(False)
-    present = [outcome for outcome, number in count_outcomes(one.cells).items() if number]
-    handles = [Patch(color=COLOURS[outcome][0], label=outcome) for outcome in OUTCOMES if outcome in present]
+    present = [outcome for outcome, number in studies.count_outcomes(one.cells).items() if number]
+    handles = [Patch(color=COLOURS[outcome][0], label=outcome) for outcome in studies.OUTCOMES if outcome in present]
     if one.is_partly_reachable:
         handles.append(Patch(facecolor="none", edgecolor="#14191d", linewidth=1.4, label="a job can reach this"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
@@ -106,7 +96,7 @@ def draw(one: StabilityMap, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
+def _panel(axes: Any, one: studies.StabilityMap, panel: str) -> None:
     from matplotlib.patches import Rectangle
 
     cells = one.panel_cells(panel)
@@ -128,8 +118,8 @@ def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
     axes.tick_params(length=0)
     if line := one.lines.get(panel):
         axes.plot(
-            [tick_position(xs, x) for x, _ in line],
-            [tick_position(ys, y) for _, y in line],
+            [studies.tick_position(xs, x) for x, _ in line],
+            [studies.tick_position(ys, y) for _, y in line],
             color="#1f2937",
             lw=1.6,
             ls="--",
@@ -150,4 +140,4 @@ def _fit_axes(axes: Any) -> None:
 
 
 def _wrap_label(value: float | str) -> str:
-    return textwrap.fill(format_tick(value), _TICK_LETTERS, break_long_words=False)
+    return textwrap.fill(studies.format_tick(value), _TICK_LETTERS, break_long_words=False)

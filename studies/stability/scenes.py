@@ -2,8 +2,6 @@
 
 They are flat and tall boxes on a table, boxes among walls and neighbours, and too small or large boxes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product

@@ -1,7 +1,5 @@
 """Stability studies by name, full or quick; and the baselines on difficult shapes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product

@@ -10,8 +10,8 @@ import trimesh
 
 import graspd
 from benchmarks.large_index import fill
+from docs.tables import STUB, keywords_stub
 from graspd.service.command_options import validate_options
-from graspd.service.docs import STUB, keywords_stub
 from graspd.service.index.index import Index
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import InputError

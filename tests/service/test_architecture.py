@@ -8,7 +8,7 @@ import tomllib
 
 import pytest
 
-from graspd.service.docs import PAGES, PARTS, update_tables
+from docs.tables import PAGES, PARTS, update_tables
 from graspd.service.settings import GONE, Settings
 from tests.conftest import PACKAGES, REPOSITORY
 

@@ -1,7 +1,5 @@
 """Squeeze posture of a gripper: its jaws close to contact, then further by force / position gain."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

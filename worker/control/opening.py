@@ -1,8 +1,6 @@
 """Opening of hands from their grasps, on a device.
 Purpose: see `worker.control.postures`; method: `worker.simulation.kernels.opening` and `.jamming`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Final
 

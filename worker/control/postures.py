@@ -4,8 +4,6 @@ Both affect a grasp's success more than the optimiser does (Dexonomy, table VI).
 
 A finger at rest on the table would sweep through the table on opening. Pregrasps of such hands are raised slightly."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -3,8 +3,6 @@
 The hand is position-controlled: q_squeeze = q + Kp^-1 sum_i J_i^T f_i (Dexonomy). The forces f are non-negative
 combinations of friction pyramid edges without a net wrench, and their normal components sum to a given force."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final
 

@@ -3,8 +3,6 @@
 A folder of precompiled kernels has the layout of Warp's cache, VERSION/MODULE/FILE. File names contain the digest of
 the module's source and options, and the architecture. Kernels that do not match a machine are compiled as usual."""
 
-from __future__ import annotations
-
 import logging
 import os
 import pkgutil

@@ -1,7 +1,5 @@
 """Default numbers of batches per launch, and of processes that validate and measure."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 

@@ -3,8 +3,6 @@
 After a numerical divergence MuJoCo resets the state and continues: an object back at its initial pose would count as
 held."""
 
-from __future__ import annotations
-
 import logging
 from typing import Any, Final
 

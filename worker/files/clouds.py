@@ -1,7 +1,5 @@
 """Point clouds as files, one npz for each views shard, and the hand of each grasp as points."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from itertools import groupby

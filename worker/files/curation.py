@@ -1,7 +1,5 @@
 """Subsets of datasets: balanced over types, approach directions or resting faces, or most different."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

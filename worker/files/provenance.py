@@ -2,8 +2,6 @@
 
 Files are identified by digest, so a modified or different file is never used instead."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -253,7 +251,7 @@ def scenes_of_shard(shard: Shard) -> PlacedGrasps | None:
 
 
 def check_wrist_poses(shard: Shard, hand: str, obj: str, options: Mapping[str, Any]) -> None:
-    """Check that wrist poses of a shard hold for a hand and an object with mesh options: the object by its digest.
+    """Check that wrist poses of a shard hold for a hand and an object with mesh options, by digest.
     Raises InputError: another object, or a hand of another name and digest."""
     said, file = shard.attributes, shard.path
     name, files, _ = object_files(Path(obj))

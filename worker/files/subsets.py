@@ -1,7 +1,5 @@
 """Subsets of a dataset as their own base shards, and the selection of grasps by a command."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from itertools import groupby

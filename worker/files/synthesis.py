@@ -1,7 +1,5 @@
 """Synthesis of grasps as in a job, without a service: from hand and object files to a shard in memory."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext

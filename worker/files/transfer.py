@@ -1,7 +1,5 @@
 """Transfer of grasps to another hand: same type, contact region and approach, validated anew."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Closing direction of each joint from the motion of its fingertips; joint limits break ties."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

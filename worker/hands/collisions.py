@@ -1,7 +1,5 @@
 """Bodies of a hand that touch at rest, and are therefore exempt from self-collision."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

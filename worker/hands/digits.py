@@ -1,7 +1,5 @@
 """Digits of a hand: their names, the parts of their surface, and hands that use some of them only."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from enum import IntEnum

@@ -3,8 +3,6 @@
 The pads of `worker.hands.pinch_postures` are farther from the fingertips' ends than a flat object is high. The search
 is the same, but over the surface within the object's height above the plane."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass
 from typing import Final

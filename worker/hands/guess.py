@@ -1,7 +1,5 @@
 """Guesses of values that a URDF lacks: fingertips, closing, palm and pre-shape; options override them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Comparison of two models of one hand: matching joints, relative pose of bases, fingertip agreement."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

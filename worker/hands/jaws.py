@@ -3,8 +3,6 @@
 A gripper is a hand with at most two degrees of freedom. Its closing motion brings opposing surfaces (pads) together.
 Everything follows from geometry, so a joint at 0 may be open or closed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final

@@ -1,7 +1,5 @@
 """Forward kinematics and transposed Jacobian of a hand in float64 NumPy: reference of the kernels."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -3,8 +3,6 @@
 Bodies become links. Several joints of a body become a chain of joints with links between them. Elements that a hand
 does not need, and files outside the upload, never reach MuJoCo: see `worker.objects.mjcf_source`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -19,13 +17,11 @@ from graspd.worker.hands.mjcf_drives import Couplings, bodies_to_root, commanded
 from graspd.worker.hands.primitives import hull
 from graspd.worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, build_robot
 from graspd.worker.hands.tree import joint_motion
-from graspd.worker.objects.mjcf_source import compile_model
+from graspd.worker.objects.mjcf_source import HIDDEN_GROUP, compile_model, mesh_of_geom
 
 _FREE, _HINGE, _SLIDE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "HINGE", "SLIDE"))
 #: Colour that MuJoCo gives to a geom without a stated colour; such a geom has its material's colour.
 _UNSTATED_COLOUR: Final = np.array([0.5, 0.5, 0.5, 1.0])
-#: First group that MuJoCo's viewer does not draw.
-_HIDDEN_GROUP: Final = 3
 #: Distance below which a joint's anchor is at its body's origin [m].
 _AT_ORIGIN_M: Final = 1e-12
 
@@ -152,9 +148,9 @@ class _Reader:
         geoms = range(first, first + count) if count else range(0)
         touching = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
         # Some models define contacts only by pairs: then all geoms in the collision groups count.
-        touching = touching or [g for g in geoms if self._bare and model.geom_group[g] >= _HIDDEN_GROUP]
-        shown = [g for g in geoms if g not in touching and model.geom_group[g] < _HIDDEN_GROUP]
-        shown = shown or [g for g in touching if model.geom_group[g] < _HIDDEN_GROUP]
+        touching = touching or [g for g in geoms if self._bare and model.geom_group[g] >= HIDDEN_GROUP]
+        shown = [g for g in geoms if g not in touching and model.geom_group[g] < HIDDEN_GROUP]
+        shown = shown or [g for g in touching if model.geom_group[g] < HIDDEN_GROUP]
         mass = float(model.body_mass[body])
         return Link(
             name,
@@ -178,11 +174,7 @@ class _Reader:
             case mujoco.mjtGeom.mjGEOM_ELLIPSOID:
                 yield Shape("mesh", (1.0, 1.0, 1.0), pose, mesh=_ellipsoid(np.array(size)))
             case mujoco.mjtGeom.mjGEOM_MESH:
-                mesh = int(model.geom_dataid[geom])
-                vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
-                vertices = np.asarray(model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]], float)
-                faces = np.asarray(model.mesh_face[face : face + model.mesh_facenum[mesh]], np.int32)
-                yield Shape("mesh", (1.0, 1.0, 1.0), pose, mesh=(vertices, faces))
+                yield Shape("mesh", (1.0, 1.0, 1.0), pose, mesh=mesh_of_geom(model, geom))
 
     def _colour(self, geom: int) -> tuple[float, float, float] | None:
         rgba, material = self.model.geom_rgba[geom], int(self.model.geom_matid[geom])

@@ -3,8 +3,6 @@
 Couplings are linear in their drivers. A four-bar linkage is a tree with ends connected by `connect` constraints. The
 loops are solved over the drivers' ranges. A line approximates each passive joint, and a note reports its error."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, Final

@@ -4,8 +4,6 @@ The mounting is its own kinematic tree from the hand's root up the robot. The tr
 one value, and at most `MAX_WRIST_JOINTS` wrist joints: revolute, of limited range, near the root. The first other joint
 belongs to an arm, whose poses a grasp does not determine."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import product

@@ -1,7 +1,5 @@
 """Options of a hand in addition to its URDF: facts that a URDF cannot contain or often states wrongly."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import PurePosixPath

@@ -1,7 +1,5 @@
 """Common, checked result of the URDF, MJCF and USD readers: links with shapes, and a tree of joints."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final

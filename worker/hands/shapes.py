@@ -4,8 +4,6 @@ Primitives stay exact. A mesh becomes one hull, or several hulls if its surface 
 The error of a mesh's pieces is the depth of the mesh surface beneath them, along the shortest free direction outward.
 The ninth decile over the visible outer surface counts."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from typing import Final

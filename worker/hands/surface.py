@@ -1,7 +1,5 @@
 """Fixed, even sample of the hand's outer surface, with normals and the area of each point."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass
 from functools import cached_property, partial

@@ -1,7 +1,5 @@
 """Tendons: drives that pull several joints and command their sum; contact determines each share."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 The common URDF libraries accept reversed limits, NaN, unknown mimics and several roots; this reader refuses them with a
 message. Those libraries also resolve mimic chains wrongly."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Final
@@ -13,7 +11,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from graspd.service.model.errors import HandError
-from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_from_axis_angle, quat_multiply
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_from_rpy
 from graspd.worker.hands.robot import MAX_LENGTH_M, MOVING, UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
 from graspd.worker.objects.xml_document import parse_xml
 
@@ -219,6 +217,4 @@ def _origin(element: Element, what: str) -> Floats:
     rpy = _parse_vector(node, "rpy", f"origin of {what}", default=(0.0, 0.0, 0.0))
     if max(map(abs, xyz)) > MAX_LENGTH_M:
         raise HandError(f"origin of {what} lies {max(map(abs, xyz)):g} m away; URDF lengths are metres")
-    # Rotations about the fixed axes x, then y, then z.
-    x, y, z = quat_from_axis_angle(np.eye(3), np.array(rpy))
-    return np.concatenate([xyz, quat_multiply(z, quat_multiply(y, x))])
+    return np.concatenate([xyz, quat_from_rpy(np.array(rpy))])

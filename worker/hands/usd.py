@@ -3,8 +3,6 @@
 Schema: https://openusd.org/release/api/usd_physics_page_front.html. Limits in degrees and drives per degree are
 converted to SI units. A link's frame is its body's, without scale."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -232,7 +230,7 @@ def _stated(value: float) -> float:
 
 
 def _free_axes(joint: Mapping[str, Any]) -> list[tuple[str, tuple[float, float]]]:
-    """Return the free axes of a joint with limits [degrees or stage units]; an axis with low > high is locked."""
+    """Return the free axes of a joint with limits [degrees or stage units]; low > high locks an axis."""
     limits = float(joint.get("lowerLimit", -math.inf)), float(joint.get("upperLimit", math.inf))
     match joint["kind"]:
         case "Fixed":

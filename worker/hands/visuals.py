@@ -2,8 +2,6 @@
 
 Only pictures need visual elements. An unreadable file is therefore left out and does not make a hand unusable."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

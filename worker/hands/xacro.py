@@ -3,8 +3,6 @@
 Expressions in xacro are Python. The child receives the hand's text files in memory, then loses access to files, network
 and commands: see `worker.hands.xacro_child`."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import PurePosixPath

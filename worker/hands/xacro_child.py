@@ -4,8 +4,6 @@ Expressions in xacro are Python, and the library's guards can be bypassed. This 
 Names that lead out of an expression are refused. An audit hook refuses access to files, processes and the network. The
 kernel gives no new file descriptor, which every file, socket and program needs."""
 
-from __future__ import annotations
-
 import ast
 import fnmatch
 import io

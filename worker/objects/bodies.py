@@ -1,9 +1,7 @@
-"""One rigid body from a URDF, SDF or MJCF: shapes in the frame of its root link or model, and its mass and friction.
+"""One rigid body from a URDF, SDF or MJCF: shapes in the frame of its root, mass and friction.
 
 A description and its meshes are one ZIP of files of an upload. MuJoCo reads a sanitised MJCF: see
 `worker.objects.mjcf_source`."""
-
-from __future__ import annotations
 
 import math
 import posixpath
@@ -18,8 +16,8 @@ import manifold3d
 import numpy as np
 
 from graspd.service.model.errors import HandError, MeshError
-from graspd.service.model.matter import MOST_KG
-from graspd.service.model.transforms import Floats, pose_to_matrix, quat_from_axis_angle, quat_multiply
+from graspd.service.model.matter import MOST_FRICTION, MOST_KG
+from graspd.service.model.transforms import Floats, pose_to_matrix, quat_from_rpy
 from graspd.service.store.assets import pack, unpack
 from graspd.service.store.body_files import SUFFIXES as SUFFIXES
 from graspd.service.store.library import UNPACKED_LIMIT_BYTES
@@ -27,15 +25,11 @@ from graspd.service.store.mesh_files import find_mesh
 from graspd.worker.objects.formats import READERS, Soup, read_mesh
 from graspd.worker.objects.formats.soup import Part, check_soup, join_parts
 from graspd.worker.objects.mesh_geometry import from_manifold
-from graspd.worker.objects.mjcf_source import MAX_BYTES, compile_model
+from graspd.worker.objects.mjcf_source import HIDDEN_GROUP, MAX_BYTES, compile_model, mesh_of_geom
 from graspd.worker.objects.xml_document import parse_xml
 
-#: Coefficient of friction above which a stated one is limited.
-_MOST_FRICTION: Final = 3.0
 #: Segments of a circle in round primitives: chords stay within 0.13 % of the radius.
 _SEGMENTS: Final = 64
-#: First group that MuJoCo's viewer does not draw.
-_HIDDEN_GROUP: Final = 3
 _UNKNOWN: Final = np.full(3, np.nan)
 #: Mass [kg], centre of mass (3,) [m], and inertia (3, 3) about it [kg m^2], nan if not stated.
 _Inertial = tuple[float, Floats, Floats]
@@ -56,7 +50,7 @@ def pack_body(files: Mapping[str, bytes]) -> bytes:
 
 
 def read_body(main: str, packed: bytes) -> list[Soup]:
-    """Read the visible shapes of the body `main` as one mesh, and the collision shapes as another; one may be missing.
+    """Read the visible shapes of a body as one mesh, its collision shapes as another; one may be missing.
     Raises MeshError: no single rigid body, a value that no body can have, or a mesh that is missing or unreadable.
     LimitError: too large."""
     files = unpack(packed, limit_bytes=UNPACKED_LIMIT_BYTES)
@@ -76,7 +70,7 @@ def read_body(main: str, packed: bytes) -> list[Soup]:
 
 def _matter(body: _Body) -> dict[str, Any]:
     """Return the fields `matter` and `inertial` of a soup; the lowest friction counts."""
-    matter = {"friction": min(*body.frictions, _MOST_FRICTION)} if body.frictions else {}
+    matter = {"friction": min(*body.frictions, MOST_FRICTION)} if body.frictions else {}
     mass = sum(one[0] for one in body.inertials)
     if not 0 < mass <= MOST_KG:
         return {"matter": matter}
@@ -130,7 +124,7 @@ def _moments(inertia: Element | None) -> Floats:
 
 
 def _inertial(mass: float, place: Floats, inertia: Floats) -> _Inertial:
-    """Return the mass, and the centre and inertia of a frame at the 4x4 matrix `place`, in the frame of the body."""
+    """Return mass, centre and inertia in the frame of the body, of a frame at the matrix `place`."""
     turn = place[:3, :3]
     return mass, place[:3, 3], turn @ inertia @ turn.T
 
@@ -178,8 +172,7 @@ def _pose(element: Element) -> Floats:
     else:
         numbers = _floats((pose.text if pose is not None else "") or "0 0 0 0 0 0", 6)
     angles = np.array(numbers[3:]) * (np.pi / 180 if pose is not None and pose.get("degrees") in ("1", "true") else 1)
-    x, y, z = quat_from_axis_angle(np.eye(3), angles)
-    return pose_to_matrix(np.concatenate([numbers[:3], quat_multiply(z, quat_multiply(y, x))]))
+    return pose_to_matrix(np.concatenate([numbers[:3], quat_from_rpy(angles)]))
 
 
 def _value(element: Element, key: str, default: str) -> str:
@@ -218,7 +211,7 @@ def _read_mjcf(files: Mapping[str, bytes], main: str) -> _Body:
                 found.collisions.append(part)
                 # MuJoCo fills in the friction of geoms that state none.
                 found.frictions += [float(model.geom_friction[geom][0])] if is_friction_stated else []
-            elif model.geom_group[geom] < _HIDDEN_GROUP:
+            elif model.geom_group[geom] < HIDDEN_GROUP:
                 found.visuals.append(part)
     for body in sorted(with_geoms):
         if (mass := float(model.body_mass[body])) > 1e-8:
@@ -232,11 +225,8 @@ def _geom_part(model: Any, geom: int, matrix: Floats) -> Part:
 
     size, name = [float(value) for value in model.geom_size[geom]], (str(model.geom(geom).name),)
     if (kind := mujoco.mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_").lower()) == "mesh":
-        mesh = int(model.geom_dataid[geom])
-        vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
-        vertices = np.array(model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]], float)
-        faces = np.array(model.mesh_face[face : face + model.mesh_facenum[mesh]], np.int64)
-        return vertices, faces, matrix, _UNKNOWN, name
+        vertices, faces = mesh_of_geom(model, geom)
+        return vertices, faces.astype(np.int64), matrix, _UNKNOWN, name
     if kind == "ellipsoid":
         kind, size, matrix = "sphere", [1.0], matrix @ np.diag([*size, 1.0])
     # MuJoCo states half lengths.

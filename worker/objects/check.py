@@ -1,7 +1,5 @@
 """Check of an uploaded object: accepted, accepted with repairs, or refused with the reason."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Convex pieces of a mesh by CoACD (Wei et al. 2022), which runs in a child process (`_decompose`)."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging

@@ -1,7 +1,5 @@
 """Disk cache of arrays that are expensive to compute from a few inputs, and digests of models as keys."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import platform

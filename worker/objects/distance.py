@@ -1,7 +1,5 @@
 """Distance from points to a triangle mesh, and the deviation between two meshes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

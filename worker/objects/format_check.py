@@ -1,7 +1,5 @@
 """Detection of files that are not what their suffix says: pointers, error pages, archives."""
 
-from __future__ import annotations
-
 import io
 import re
 import zipfile

@@ -1,7 +1,5 @@
 """Writer of binary glTF 2.0 documents with triangles and points."""
 
-from __future__ import annotations
-
 import json
 import struct
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Self-intersections of a surface, and their removal such that the overlap counts once."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import manifold3d

@@ -1,7 +1,5 @@
 """Child process of a reader of untrusted files, with the environment that it needs and no credentials."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -16,7 +14,7 @@ _ONE_THREAD: Final = dict.fromkeys(("PXR_WORK_THREAD_LIMIT", "OPENBLAS_NUM_THREA
 
 
 def run_isolated(module: str, *arguments: str, data: bytes = b"", what: str) -> bytes:
-    """Run a module with `data` on its standard input; return its output, which is cut off if the child crashed.
+    """Run a module with `data` on its standard input; return its output, cut off if the child crashed.
     Raises OSError: the child was killed or hung; `what` is the file in the message."""
     passed_on = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     try:

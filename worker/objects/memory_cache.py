@@ -1,7 +1,5 @@
 """Cache in memory of results for hands and objects; models are compared by content, not by name."""
 
-from __future__ import annotations
-
 import inspect
 import threading
 from collections.abc import Callable, Hashable

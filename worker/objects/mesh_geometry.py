@@ -3,8 +3,6 @@
 An object has two frames with the same axes. Poses are stored in the file's frame. The engine works in the centred frame
 at the middle of the mesh's bounding box. Results therefore have the same bits for every origin of the file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final
 

@@ -3,8 +3,6 @@
 MuJoCo reads any file on disk that a model names. This module therefore inserts includes, renames meshes of the hand's
 files, and removes all parts that a hand does not need. Only the elements listed here reach MuJoCo."""
 
-from __future__ import annotations
-
 import math
 import posixpath
 import xml.etree.ElementTree as ElementTree
@@ -12,12 +10,18 @@ from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from graspd.service.model.errors import HandError, LimitError
+from graspd.service.model.transforms import Floats
 from graspd.service.store.mesh_files import match_name
 from graspd.worker.objects.format_check import check_format
 from graspd.worker.objects.xml_document import parse_xml
 
 MAX_BYTES: Final = 8 * 2**20
+#: First group that MuJoCo's viewer does not draw.
+HIDDEN_GROUP: Final = 3
 _MAX_INCLUDES: Final = 64
 _MAX_ELEMENTS: Final = 50_000
 Element = ElementTree.Element
@@ -37,7 +41,7 @@ _MESHES: Final = (".stl", ".obj", ".msh")
 
 
 def compile_model(files: Mapping[str, bytes], main: str) -> tuple[Any, str, list[str]]:
-    """Return MuJoCo's model, its text, and notes for the user; HandError if MuJoCo rejects it; see `inline_model`."""
+    """Return MuJoCo's model, its text, and notes for the user (`inline_model`); HandError if rejected."""
     import mujoco  # slow to load
 
     text, assets, notes = inline_model(files, main)
@@ -46,6 +50,14 @@ def compile_model(files: Mapping[str, bytes], main: str) -> tuple[Any, str, list
     except (ValueError, RuntimeError, OSError, mujoco.FatalError) as error:
         line = " ".join(str(error).replace("XML Error:", "").split())[:200]
         raise HandError(f"{main}: MuJoCo rejects it ({line}); correct the model") from None
+
+
+def mesh_of_geom(model: Any, geom: int) -> tuple[Floats, NDArray[np.int32]]:
+    """Return vertices (V, 3) and triangles (F, 3) of a mesh geom in its own frame."""
+    mesh = model.mesh(int(model.geom_dataid[geom]))
+    vertex, face = int(mesh.vertadr[0]), int(mesh.faceadr[0])
+    vertices = model.mesh_vert[vertex : vertex + int(mesh.vertnum[0])]
+    return np.array(vertices, float), np.array(model.mesh_face[face : face + int(mesh.facenum[0])], np.int32)
 
 
 def inline_model(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, bytes], list[str]]:

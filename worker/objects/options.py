@@ -1,7 +1,5 @@
 """Options of an object: the keys of its `asset.json`, and the mass and friction of a job."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Named and coloured parts of an uploaded mesh: labelled samples of its surface, voxels of a region."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final

@@ -1,7 +1,5 @@
 """Preparation of objects, cached by content: reading, repair, simplification, normals, hull and mass."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -61,7 +59,7 @@ def apply_options(model: ObjectModel, options: ObjectOptions) -> ObjectModel:
 
 
 def main_mesh(files: Mapping[str, bytes], options: ObjectOptions) -> tuple[str, bytes]:
-    """Return name and content of the main file; a description and its meshes, or USD layers, become one ZIP."""
+    """Return name and content of the main file; a description with its meshes, or USD layers, as a ZIP."""
     main = main_file(files, options)
     is_body = main.lower().endswith(bodies.SUFFIXES)
     return (main, bodies.pack_body(files)) if is_body else stage_package(files, main)

@@ -1,7 +1,5 @@
 """Region of an object that grasps may touch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

@@ -90,7 +90,7 @@ def repair(soup: Soup, options: ObjectOptions) -> RepairedMesh:
 
 
 def _with_inertial(mesh: RepairedMesh, soup: Soup) -> RepairedMesh:
-    """Take the stated centre of mass and inertia if masses inside the bounding box of the mesh can have them."""
+    """Take the stated centre of mass and inertia if masses inside the mesh's bounds can have them."""
     if soup.inertial is None:
         return mesh
     extent, low, high = (f(mesh.vertices, axis=0) for f in (np.ptp, np.min, np.max))

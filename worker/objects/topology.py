@@ -2,8 +2,6 @@
 
 All functions are pure: vertices (V, 3) and faces (F, 3) in, new arrays out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """XML of robots and objects from untrusted sources."""
 
-from __future__ import annotations
-
 import re
 from typing import Final
 from xml.etree.ElementTree import Element, ParseError

@@ -1,7 +1,5 @@
 """Grasp planners behind one interface: `port` defines the interface, `registry` lists the planners."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,8 +1,6 @@
 """Cache of proposal networks in this process. A method's option names a network by its digest.
 The digest is that of a local file or of an asset of the service."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """Interface of a grasp planner, implemented by `fast_graspd`, baselines and third-party planners."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

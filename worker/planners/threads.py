@@ -3,8 +3,6 @@
 Warp's CPU backend runs a launch on the calling thread, so several threads use all cores. On a GPU a batch is one part,
 halved until the memory suffices. A grasp's result does not depend on its part."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import threading

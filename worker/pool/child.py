@@ -3,8 +3,6 @@
 The process takes work from the socket with this file descriptor until the peer closes it. Data shared by several work
 items are cached by key; the pool names the keys to evict. The modules are imported before the first item."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import queue

@@ -4,8 +4,6 @@ Threads share Python's lock: work that holds it for a tenth of its time does not
 since CUDA contexts and threads do not survive a fork; they end with the parent. Python's `ProcessPoolExecutor` would
 import the program that calls `graspd.synthesize` once more in each process."""
 
-from __future__ import annotations
-
 import logging
 import os
 import pickle

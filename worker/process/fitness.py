@@ -6,8 +6,6 @@ It is also unfit if several tasks fail here in a row, of which other workers com
 A worker in quarantine is listed with the reason and gets no tasks. It repeats its check after increasing pauses and
 resumes when the check passes. If it never passes, or cannot find the fault, the process ends and a fresh one starts."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import time

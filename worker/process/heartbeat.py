@@ -1,7 +1,5 @@
 """Registration of a worker: heartbeats with its state."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable

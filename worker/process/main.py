@@ -4,8 +4,6 @@ The engine (`worker.process.engine`) lives as long as the worker: a CUDA context
 per task would load kernels and meshes every time. Worker and engine share no interpreter lock, so no kernel compilation
 prevents the renewal of the lease."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os

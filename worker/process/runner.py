@@ -1,7 +1,5 @@
 """Run a task's stage and convert its result or error to an outcome."""
 
-from __future__ import annotations
-
 import errno
 import logging
 import os
@@ -12,25 +10,8 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from graspd.service.model import names
+from graspd.service.model import errors, messages, names
 from graspd.service.model.clock import timestamp
-from graspd.service.model.errors import (
-    DamagedError,
-    DamagedShard,
-    InputError,
-    NotFoundError,
-    TaskCancelled,
-    TaskRefused,
-    UnavailableError,
-)
-from graspd.service.model.messages import (
-    IngestMessage,
-    Origin,
-    TaskMessage,
-    capabilities,
-    message_type,
-    requirements_of,
-)
 from graspd.service.model.records import AttemptRecord
 from graspd.service.model.renamed import convert_names
 from graspd.service.model.states import Stage
@@ -75,13 +56,13 @@ class Runner:
     def _run(self, message: Message, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
         started, clock = timestamp(), time.monotonic()
         try:
-            if lacking := capabilities().unmet_requirement(requirements_of(message)):
+            if lacking := messages.capabilities().unmet_requirement(messages.requirements_of(message)):
                 # The task is for another worker. The controller reports tasks that no present worker can do.
                 return self._create_event(EventKind.DEFERRED, message, message=f"this worker cannot run it: {lacking}")
             return self._run_stage(message, context)
-        except TaskCancelled:
+        except errors.TaskCancelled:
             return self._stopped_event(message, context, started)
-        except UnavailableError as error:
+        except errors.UnavailableError as error:
             return self._create_event(EventKind.DEFERRED, message, message=str(error))
         except Exception as error:
             if is_disk_full(error):
@@ -103,19 +84,19 @@ class Runner:
         if self._is_done(message, context):
             return self._create_event(EventKind.FINISHED, message, output=output, message="was there already")
         if message.stage not in self._stages:
-            raise TaskRefused(f"this worker does no {message.stage} tasks")
+            raise errors.TaskRefused(f"this worker does no {message.stage} tasks")
         self._publish(self._create_event(EventKind.STARTED, message))
         clock = time.perf_counter()
         lost = self._lost_manifest(message, context)
         made = self._stages[message.stage](message, context)
         self._check_device(context.device)
         seconds = time.perf_counter() - clock
-        if made is not None and isinstance(message, TaskMessage):
+        if made is not None and isinstance(message, messages.TaskMessage):
             context.check()
             device, worker = context.device, self._worker
             manifest, data = build_shard(message, made, device=device, seconds=seconds, worker=worker, lost=lost)
             if lost is not None and manifest.sha256 != lost.sha256:
-                raise DamagedShard(
+                raise errors.DamagedShard(
                     f"{lost.key} was made again with another content: first on {lost.device} by graspd "
                     f"{lost.code_version}, now on {device}; restore a copy"
                 )
@@ -135,14 +116,16 @@ class Runner:
         return str(error) if isinstance(error, ProcessLost) else self.device_lost
 
     def _is_done(self, message: Message, context: TaskContext) -> bool:
-        if isinstance(message, IngestMessage):
+        if isinstance(message, messages.IngestMessage):
             return context.store.exists(names.asset_check_key(message.kind, message.digest))
         file = names.shard_file_key(message.stage, message.output)
         return shard_exists(context.store, message.stage, message.output) and context.store.exists(file)
 
     def _lost_manifest(self, message: Message, context: TaskContext) -> ShardManifest | None:
         """Return the manifest of a shard that was made before but has lost its file."""
-        if isinstance(message, IngestMessage) or not shard_exists(context.store, message.stage, message.output):
+        if isinstance(message, messages.IngestMessage) or not shard_exists(
+            context.store, message.stage, message.output
+        ):
             return None
         return load_manifest(context.store, message.stage, message.output)
 
@@ -155,9 +138,12 @@ class Runner:
         return None if kind is None else self._create_event(kind, message, output=output_id(message))
 
     def _failure_event(self, message: Message, error: Exception, context: TaskContext, started: str) -> Event:
-        log.warning("task failed: %s", error, exc_info=not isinstance(error, InputError))
+        log.warning("task failed: %s", error, exc_info=not isinstance(error, errors.InputError))
         # Retries fix neither invalid input nor a damaged store.
-        last = isinstance(error, InputError | DamagedError | TaskRefused) or message.attempt >= message.max_attempt
+        last = (
+            isinstance(error, errors.InputError | errors.DamagedError | errors.TaskRefused)
+            or message.attempt >= message.max_attempt
+        )
         attempt = AttemptRecord.from_message(
             message,
             kind=type(error).__name__,
@@ -168,50 +154,50 @@ class Runner:
             last=last,
         )
         try:
-            if isinstance(message, TaskMessage) and _has_manifest(message, context):
+            if isinstance(message, messages.TaskMessage) and _has_manifest(message, context):
                 # The task has already succeeded: another worker was faster, or a lost file could not be made again.
                 return self._create_event(EventKind.CANCELLED, message, message=attempt.reason)
             put_record(context.store, names.attempt_key(attempt.task_id, attempt.number), attempt)
-        except UnavailableError as error:
+        except errors.UnavailableError as error:
             return self._create_event(EventKind.DEFERRED, message, message=f"{attempt.reason}; {error}")
         return self._create_event(EventKind.FAILED, message, message=attempt.reason, last=attempt.last)
 
     def _create_event(self, kind: EventKind, task: Message, **more: Any) -> Event:
         facts: dict[str, Any] = {"output": output_id(task), "stage": task.stage, "attempt": task.attempt}
-        if isinstance(task, TaskMessage):
+        if isinstance(task, messages.TaskMessage):
             facts |= {"job_id": task.job_id, "batch": task.batch}
         return Event(kind=kind, at=timestamp(), task_id=task.task_id, worker=self._worker, **facts | more)
 
 
-def _has_manifest(message: TaskMessage, context: TaskContext) -> bool:
+def _has_manifest(message: messages.TaskMessage, context: TaskContext) -> bool:
     try:
         return load_manifest(context.store, message.stage, message.output).shard_id == message.output
-    except (NotFoundError, DamagedError):
+    except (errors.NotFoundError, errors.DamagedError):
         return False
 
 
 def parse_message(raw: Mapping[str, Any]) -> Message:
     """Parse the message of a queue entry; raise TaskRefused if it is invalid."""
     try:
-        model = message_type(raw)
+        model = messages.message_type(raw)
         # A newer schema may have more fields. Fields that identify the task must exist, so that it can be refused.
         known = {field.alias or name for name, field in model.model_fields.items()}
         return model.model_validate({key: value for key, value in convert_names(dict(raw)).items() if key in known})
     except (ValidationError, AttributeError) as error:
-        raise TaskRefused(f"an entry of the queue is no task of graspd: {_one_line(error)}") from None
+        raise errors.TaskRefused(f"an entry of the queue is no task of graspd: {_one_line(error)}") from None
 
 
 def _subjects(message: Message) -> dict[str, Any]:
     found: dict[str, Any] = {"task": message.task_id, "attempt": message.attempt}
-    if isinstance(message, TaskMessage):
-        origin = message.origin or Origin()
+    if isinstance(message, messages.TaskMessage):
+        origin = message.origin or messages.Origin()
         found |= {"job": message.job_id, "request": origin.request, "key": origin.key}
     return found
 
 
 def output_id(message: Message) -> str:
     """Return the output of a task: a shard id, or kind and digest of the checked asset."""
-    return message.output if isinstance(message, TaskMessage) else f"{message.kind.value}/{message.digest}"
+    return message.output if isinstance(message, messages.TaskMessage) else f"{message.kind.value}/{message.digest}"
 
 
 def is_disk_full(error: BaseException | None) -> bool:

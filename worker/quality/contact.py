@@ -1,7 +1,5 @@
 """Contact between hand and object: area, contact points, links in contact, evenness over the fingers."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Diversity of a set of grasps: variance (DexGraspBench), near-duplicates, and approach cells."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

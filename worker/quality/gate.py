@@ -1,7 +1,5 @@
 """Geometric gate against penetration of the object or the hand itself, regardless of the verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Final
 

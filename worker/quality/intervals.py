@@ -1,7 +1,5 @@
 """Confidence intervals of measured shares."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Posed hands on a device, in double precision, and the kernels' data of a hand and an object."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

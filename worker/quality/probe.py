@@ -1,7 +1,5 @@
 """Distances between a posed hand and an object, for many grasps at once, on a GPU or on the CPU."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

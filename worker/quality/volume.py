@@ -2,8 +2,6 @@
 
 The volume is that of an exact boolean operation on solids. If the object is not closed, voxels are counted."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import Any, Final
 

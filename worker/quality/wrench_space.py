@@ -7,8 +7,6 @@ radius. The space is the convex hull of all edges: normal forces sum to at most 
 Epsilon is the radius of the largest ball around the origin inside the space. It is 0 where the origin is not inside
 (GraspIt!: -1). Flat spaces have epsilon 0 and volume 0."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """Labels of a picture: segmentation, boxes in the picture and in space, and further channels."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Final
 

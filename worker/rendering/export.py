@@ -1,7 +1,5 @@
 """Export of views as image files: PNG, OpenEXR, and a JSON per picture with its camera and boxes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures of grasps: hand and object alone before a plain backdrop, from given sides."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 

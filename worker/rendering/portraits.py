@@ -1,7 +1,5 @@
 """Pictures of a hand or an object alone, for a user to check the model."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final

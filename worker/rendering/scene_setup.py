@@ -2,8 +2,6 @@
 
 Materials and lights are random within plausible ranges."""
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

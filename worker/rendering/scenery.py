@@ -1,7 +1,5 @@
 """Data of renders: solids, supports as boxes, materials, lights; requests and results of a shot."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

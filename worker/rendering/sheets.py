@@ -1,7 +1,5 @@
 """Pages of pictures with text: best grasps with figures, grasps from three sides, views of a shard."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache

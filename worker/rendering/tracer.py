@@ -4,8 +4,6 @@ A picture is a sum of passes. Every pass sends one ray through each pixel with o
 the pixel (anti-aliasing), and the light varies over the lamp's disc or over the sky (soft shadows). Pass 0 goes through
 the pixel centres; depth, normals and shape indices come from it alone."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Views of scenes: pictures of an object on a table, with all labels for training networks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

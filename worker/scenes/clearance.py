@@ -1,7 +1,5 @@
 """Grasps on a table: base grasps moved by the object's rest pose, checked exactly against the table."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from enum import IntEnum
 from typing import Final

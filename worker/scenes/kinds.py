@@ -1,7 +1,5 @@
 """Supports and rest poses of the scenes that users specify: tables, bins, shelves, and files."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Neighbours of a scene: reduction to a few convex pieces with few faces, and placement."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, product

@@ -1,8 +1,6 @@
 """Rollouts of candidates: short lift and clearance check in a scene, short pushes of a free object.
 Candidates that pass these tests (`worker.validation.prescreening`) are validated in the whole test."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

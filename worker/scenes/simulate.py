@@ -2,8 +2,6 @@
 
 Only the hull can touch a plane, so it is the whole collision model; mass and inertia are those of the true mesh."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

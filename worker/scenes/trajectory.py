@@ -7,8 +7,6 @@ some from boxes and neighbours' pieces are lower bounds.
 
 In a scene, the direction of the approach and the opening of the hand are chosen to avoid object and obstacles."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product

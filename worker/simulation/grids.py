@@ -3,8 +3,6 @@
 They depend on the object, the cell size and `phong_alpha`, not on the hand. Processes on a CPU cache them on disk,
 since they take a fifth of the time until a first grasp. A GPU computes them faster than a file is read."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping
 from functools import partial

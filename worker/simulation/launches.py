@@ -1,7 +1,5 @@
 """Kernel launches, recorded once and run many times with the same arguments."""
 
-from __future__ import annotations
-
 import ctypes
 import time
 from collections.abc import Callable, Iterator

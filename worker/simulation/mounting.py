@@ -1,8 +1,6 @@
 """Clearance of a hand's mounting (links above its root) from obstacles, and choice of wrist angles.
 Planners use the clearance of the mounting's points, which is cheap; validity uses the exact clearance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """Levenberg-Marquardt projection of hands out of penetration that keeps contacts (kernels.projection)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final
 

@@ -2,8 +2,6 @@
 
 `record_*` records a whole list for the data's current schedule; `add_*` appends one part. No data leaves the device."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from graspd.service.model.errors import InputError

@@ -1,7 +1,5 @@
 """Even samples of a mesh's surface."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

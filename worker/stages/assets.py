@@ -1,8 +1,6 @@
 """Inputs of tasks from the store: hands, objects, networks, convex pieces and shards, cached.
 The first worker that needs an object repairs and simplifies it, and stores the result."""
 
-from __future__ import annotations
-
 import threading
 import zipfile
 from collections.abc import Callable, Hashable

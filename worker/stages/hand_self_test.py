@@ -1,8 +1,6 @@
 """Self-test of a hand: grasps of a sphere, a box and a cylinder of suitable size.
 Free grasps are validated at level standard; other grasps lift the objects off a table."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Check of an upload in a child process: a hostile file may crash the child, not the worker."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

@@ -6,8 +6,6 @@ Node `extras` contain the joint tree: a node's pose is parent * rest pose * moti
 surface are POINTS primitives. For a body drawn with visual meshes, `extras` name the mesh of its collision shapes,
 which no node draws. The document's `extras` contain facts, link frames, joint drives and pads of the hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Final
 

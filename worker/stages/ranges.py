@@ -1,7 +1,5 @@
 """Tasks of several batches: each batch is made as if alone, and a shard concatenates their rows."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from itertools import accumulate

@@ -1,7 +1,5 @@
 """Stage render: pictures of scenes in a views shard."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stage scene: makes scenes in which grasps are then planned, or transfers free grasps to scenes."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stage synthesize: grasps of a hand on an object with their quality, in a base shard."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial

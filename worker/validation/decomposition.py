@@ -5,8 +5,6 @@ object. Count, volume ratio and excess are stored with every verdict; pieces wit
 is the volume added by the union of the pieces, divided by the object's surface area: the mean height of the added
 material."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 from dataclasses import dataclass, replace

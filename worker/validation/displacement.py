@@ -4,8 +4,6 @@ The hand is fixed in its grasp posture. The object has mass 1 kg and friction co
 its frame for 35 steps of 1/240 s. In free fall it would move by 10.7 cm. The protocol was made for PyBullet with a
 restitution of 0.5; MuJoCo has no restitution."""
 
-from __future__ import annotations
-
 import math
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final

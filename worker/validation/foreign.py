@@ -3,8 +3,6 @@
 The other model provides the mechanism: shapes, masses, joint frames, limits, couplings, armature and dry friction. The
 grasp's own model provides the controller: commanded postures, gains, damping and torque limits."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Key of a verdict: digest of all that affects it. Only success rates with equal keys are comparable."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
 from types import ModuleType

@@ -7,8 +7,6 @@ allows. It rises smoothly in 0.8 s and holds for 2 s, with early termination as 
 bodies on the table, which must not move by 2 cm or topple. The world frame of the simulation is the object frame at
 rest."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Lift tests of many grasps in their scenes, on all cores."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import asdict, dataclass
 from typing import Final, Literal, get_args

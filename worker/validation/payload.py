@@ -13,8 +13,6 @@ program per direction of the weight. Forces inside friction pyramids balance the
 of mass, and no drive exceeds its effort. The result is an upper bound: maybe no controller can exert the forces, and
 pyramids enclose the cones. Forces on the palm, along joint axes, or towards a joint's stop cost no effort."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable

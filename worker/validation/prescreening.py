@@ -5,8 +5,6 @@ pulls for a moment. A free object is pushed towards the corners of a tetrahedron
 is halved. Objects that slip are tested once more from the same closed hand at full friction; in a scene the pull is
 then 30 % above the weight. The full test still validates the selected candidates."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from typing import Final, TypeVar

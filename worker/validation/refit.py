@@ -3,8 +3,6 @@
 hull: one convex hull per link. primitive: the best-fitting box, cylinder or capsule of each hull. capsule: a capsule
 for each piece whose width and thickness are similar. All of these may be grown or shrunk."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import groupby

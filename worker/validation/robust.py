@@ -4,8 +4,6 @@ Each of k models differs from the nominal one along one axis (`variant`); axes a
 only on the seed and the grasp's own numbers. A grasp therefore gets the same models in any set, and the first 8 of 16
 models equal those of a test with 8."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import time

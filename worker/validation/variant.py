@@ -3,8 +3,6 @@
 `draw_variant` draws a `Variant`, and `Models` validates in it: new shapes are recompiled, other numbers changed in a
 copy."""
 
-from __future__ import annotations
-
 import copy
 import threading
 from collections.abc import Iterator, Sequence

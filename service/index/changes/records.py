@@ -1,7 +1,5 @@
 """Idempotent changes of rows by API and controller: jobs and datasets, states of tasks and workers."""
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence

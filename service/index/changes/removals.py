@@ -1,7 +1,5 @@
 """Removal of rows that nothing else needs. All removals are idempotent."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from sqlalchemy import Connection, delete, exists, func, insert, or_, select, update

@@ -1,19 +1,10 @@
 """Queries of hands and objects, and of named sets of objects."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 from sqlalchemy import ColumnElement, Connection, and_, case, or_, select
 
-from graspd.service.index.database import (
-    IndexPart,
-    asset_scope_conditions,
-    asset_scope_order,
-    page_rows,
-    rows_in,
-    scope_conditions,
-)
+from graspd.service.index import database
 from graspd.service.index.tables import assets, object_sets
 from graspd.service.index.views import AssetView, ObjectSetView, Page
 from graspd.service.model.errors import SEARCHED, NotFoundError, available_names
@@ -21,7 +12,7 @@ from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.states import AssetKind
 
 
-class Assets(IndexPart):
+class Assets(database.IndexPart):
     def page(
         self,
         kind: AssetKind,
@@ -32,12 +23,12 @@ class Assets(IndexPart):
         scope: ProjectScope = EVERYTHING,
     ) -> Page[AssetView]:
         """Return a page of hands or objects in all versions, newest first; `refused` includes refused ones."""
-        query = select(assets).where(assets.c.kind == kind.value, *asset_scope_conditions(scope))
+        query = select(assets).where(assets.c.kind == kind.value, *database.asset_scope_conditions(scope))
         if not refused:
             query = query.where(_not_refused())
         with self.database.read_transaction() as connection:
             key = assets.c.created, assets.c.digest
-            rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
+            rows, following = database.page_rows(connection, query, *key, limit=limit, cursor=cursor)
         return Page(items=[AssetView(**row) for row in rows], next=following)
 
     def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:
@@ -45,24 +36,26 @@ class Assets(IndexPart):
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
         refused_last = case((assets.c.verdict == "refuse", 1), else_=0)
-        query = select(assets).where(named | by_digest, *asset_scope_conditions(scope))
-        order = (refused_last, asset_scope_order(scope), assets.c.created.desc(), assets.c.digest.desc())
+        query = select(assets).where(named | by_digest, *database.asset_scope_conditions(scope))
+        order = (refused_last, database.asset_scope_order(scope), assets.c.created.desc(), assets.c.digest.desc())
         if found := self.database.rows(query.order_by(*order).limit(1)):
             return AssetView(**found[0])
-        known = select(assets.c.name).where(assets.c.kind == kind.value, _not_refused(), *asset_scope_conditions(scope))
+        known = select(assets.c.name).where(
+            assets.c.kind == kind.value, _not_refused(), *database.asset_scope_conditions(scope)
+        )
         names = self.database.column(known.distinct().order_by(assets.c.name).limit(SEARCHED))
         raise NotFoundError(f"there is no {kind.value} {name_or_digest!r}{available_names(name_or_digest, names)}")
 
     def sizes(self, kind: AssetKind, wanted: Collection[str], *, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
         """Return the sizes [bytes] of the named hands or objects; unknown names are omitted."""
         query = select(assets.c.name, assets.c.size_bytes).order_by(assets.c.created)
-        query = query.where(assets.c.kind == kind.value, *asset_scope_conditions(scope))
+        query = query.where(assets.c.kind == kind.value, *database.asset_scope_conditions(scope))
         sizes = {row["name"]: row["size_bytes"] for row in self.database.rows(query)}
         return {name: sizes[name] for name in wanted if name in sizes}
 
     def missing(self, wanted: Collection[tuple[AssetKind, str]], *, within: Connection) -> list[str]:
         query = select(assets.c.kind, assets.c.digest)
-        rows = rows_in(within, query, assets.c.digest, {digest for _, digest in wanted})
+        rows = database.rows_in(within, query, assets.c.digest, {digest for _, digest in wanted})
         known = {(AssetKind(kind), digest) for kind, digest in rows}
         return [f"{kind.value} {digest}" for kind, digest in wanted if (kind, digest) not in known]
 
@@ -72,9 +65,9 @@ def _not_refused() -> ColumnElement[bool]:
     return or_(assets.c.verdict.is_(None), assets.c.verdict != "refuse")
 
 
-class ObjectSets(IndexPart):
+class ObjectSets(database.IndexPart):
     def newest_versions(self, *, scope: ProjectScope = EVERYTHING) -> list[ObjectSetView]:
-        query = select(object_sets).where(*scope_conditions(scope, object_sets))
+        query = select(object_sets).where(*database.scope_conditions(scope, object_sets))
         query = query.order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
         return list({row["name"]: ObjectSetView(**row) for row in self.database.rows(query)}.values())
 

@@ -1,7 +1,5 @@
 """Queries of datasets, their cells and snapshots."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from typing import Any, Final

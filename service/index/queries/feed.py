@@ -1,7 +1,5 @@
 """Queries of the controller: tasks to queue, tasks marked as queued, cells of datasets without a job."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass

@@ -18,14 +18,7 @@ from pydantic import Field
 from sqlalchemy import ColumnElement, Connection, Float, Select, String, Subquery, and_, func, not_, or_, select, tuple_
 from sqlalchemy.sql.operators import in_op, is_
 
-from graspd.service.index.database import (
-    IndexPart,
-    chunks,
-    decode_cursor,
-    encode_cursor,
-    page_size,
-    shard_scope_conditions,
-)
+from graspd.service.index import database
 from graspd.service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
 from graspd.service.index.views import GraspView, Page
 from graspd.service.model.base import Model
@@ -52,7 +45,7 @@ class GraspSort(Model):
 _BEST_FIRST = GraspSort()
 
 
-class Grasps(IndexPart):
+class Grasps(database.IndexPart):
     def page(
         self,
         where: GraspFilter | None = None,
@@ -61,17 +54,17 @@ class Grasps(IndexPart):
         limit: int = 50,
         cursor: str | None = None,
     ) -> Page[GraspView]:
-        size = page_size(limit)
-        start = None if cursor is None else decode_cursor(cursor, (float, int, str, type(None)), str, int)
+        size = database.page_size(limit)
+        start = None if cursor is None else database.decode_cursor(cursor, (float, int, str, type(None)), str, int)
         with self.database.read_transaction() as connection:
             rows = search(connection, where, sort, size + 1, start)
         views = [GraspView(**row) for row in rows[:size]]
         last = rows[size - 1] if len(rows) > size else None
-        return Page(items=views, next=last and encode_cursor(last[sort.by], last["shard_id"], last["row"]))
+        return Page(items=views, next=last and database.encode_cursor(last[sort.by], last["shard_id"], last["row"]))
 
     def get(self, shard_id: str, row: int, *, scope: ProjectScope = EVERYTHING) -> GraspView:
         query = select(grasps).where(grasps.c.shard_id == shard_id, grasps.c.row == row)
-        query = query.where(*shard_scope_conditions(scope, grasps.c.shard_id))
+        query = query.where(*database.shard_scope_conditions(scope, grasps.c.shard_id))
         return GraspView(**self.database.first_row(query, f"grasp {row} in shard {shard_id!r}"))
 
     def matching_grasps(self, where: GraspFilter, *, limit: int) -> list[Grasp]:
@@ -80,7 +73,7 @@ class Grasps(IndexPart):
 
     def get_many(self, wanted: Sequence[Grasp]) -> Iterator[GraspView]:
         """Yield the given grasps, ordered by shard and row, without missing ones."""
-        for some in chunks(sorted(wanted)):
+        for some in database.chunks(sorted(wanted)):
             query = select(grasps).where(tuple_(grasps.c.shard_id, grasps.c.row).in_(some))
             for row in self.database.rows(query.order_by(grasps.c.shard_id, grasps.c.row)):
                 yield GraspView(**row)

@@ -1,21 +1,12 @@
 """Queries of jobs, tasks, attempts and shards, and the outcomes of a job's candidates."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final, Literal
 
 from sqlalchemy import Column, ColumnElement, Connection, Float, and_, case, cast, func, select
 
-from graspd.service.index.database import (
-    IndexPart,
-    page_rows,
-    page_size,
-    scope_conditions,
-    scope_conditions_by_job,
-    shard_scope_conditions,
-)
+from graspd.service.index import database
 from graspd.service.index.tables import attempts, jobs, shards, tasks
 from graspd.service.index.views import AttemptView, JobView, Page, ShardView, StageProgress, TaskView
 from graspd.service.model.planning import count_ranges, sum_outcomes
@@ -30,7 +21,7 @@ SHARE_DONE: Final[ColumnElement[float]] = case(
 )
 
 
-class Jobs(IndexPart):
+class Jobs(database.IndexPart):
     def page(
         self,
         *,
@@ -44,15 +35,15 @@ class Jobs(IndexPart):
     ) -> Page[JobView]:
         """Return a page of jobs, the newest first; `prefix` is the beginning of their ids."""
         same = _equality_conditions({jobs.c.state: state, jobs.c.hand: hand, jobs.c.object: object})
-        query, key = select(jobs).where(*scope_conditions(scope, jobs), *same), (jobs.c.created, jobs.c.id)
+        query, key = select(jobs).where(*database.scope_conditions(scope, jobs), *same), (jobs.c.created, jobs.c.id)
         query = query.where(jobs.c.id.startswith(prefix, autoescape=True)) if prefix else query
         with self.database.read_transaction() as connection:
-            rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
+            rows, following = database.page_rows(connection, query, *key, limit=limit, cursor=cursor)
             return Page(items=_job_views(connection, rows), next=following)
 
     def get(self, job_id: str, *, scope: ProjectScope = EVERYTHING) -> JobView:
         with self.database.read_transaction() as connection:
-            query = select(jobs).where(jobs.c.id == job_id, *scope_conditions(scope, jobs))
+            query = select(jobs).where(jobs.c.id == job_id, *database.scope_conditions(scope, jobs))
             (view,) = _job_views(connection, [self.database.first_row(query, f"job {job_id!r}", connection)])
             if view.note is None:
                 return view
@@ -66,11 +57,11 @@ class Jobs(IndexPart):
         query = select(tasks).where(tasks.c.job_id == job, *_equality_conditions({tasks.c.state: state}))
         key = (tasks.c.job_id, tasks.c.batch, tasks.c.position)
         with self.database.read_transaction() as connection:
-            rows, following = page_rows(connection, query, *key, limit=limit, cursor=None, descending=False)
+            rows, following = database.page_rows(connection, query, *key, limit=limit, cursor=None, descending=False)
         return Page(items=[_task_view(row) for row in rows], next=following)
 
     def task(self, task_id: str, *, scope: ProjectScope = EVERYTHING) -> TaskView:
-        query = select(tasks).where(tasks.c.id == task_id, *scope_conditions_by_job(scope, tasks))
+        query = select(tasks).where(tasks.c.id == task_id, *database.scope_conditions_by_job(scope, tasks))
         return _task_view(self.database.first_row(query, f"task {task_id!r}"))
 
     def tasks_out_of_scope(self, task_ids: Collection[str], scope: ProjectScope) -> set[str]:
@@ -79,7 +70,7 @@ class Jobs(IndexPart):
 
     def attempts(self, *, job: str | None = None, limit: int = 50) -> list[AttemptView]:
         query = select(attempts).where(*_equality_conditions({attempts.c.job_id: job}))
-        query = query.order_by(attempts.c.ended.desc(), attempts.c.number.desc()).limit(page_size(limit))
+        query = query.order_by(attempts.c.ended.desc(), attempts.c.number.desc()).limit(database.page_size(limit))
         return [AttemptView(**row) for row in self.database.rows(query)]
 
 
@@ -154,7 +145,7 @@ def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[st
     return sum_outcomes(one for one in connection.scalars(query) if isinstance(one, dict))
 
 
-class Shards(IndexPart):
+class Shards(database.IndexPart):
     def page(
         self,
         *,
@@ -165,13 +156,13 @@ class Shards(IndexPart):
         scope: ProjectScope = EVERYTHING,
     ) -> Page[ShardView]:
         """Return a page of shards, newest first, without their manifests."""
-        query = select(shards).where(*shard_scope_conditions(scope, shards.c.id))
+        query = select(shards).where(*database.shard_scope_conditions(scope, shards.c.id))
         query = query.where(*_equality_conditions({shards.c.kind: kind}))
         if job is not None:
             query = query.where(shards.c.id.in_(select(tasks.c.shard_id).where(tasks.c.job_id == job)))
         with self.database.read_transaction() as connection:
             key = shards.c.created, shards.c.id
-            rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
+            rows, following = database.page_rows(connection, query, *key, limit=limit, cursor=cursor)
         return Page(items=[ShardView.model_validate({**row, "manifest": {}}) for row in rows], next=following)
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
@@ -180,10 +171,12 @@ class Shards(IndexPart):
 
     def job_of(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> str | None:
         """Return a job in scope that requested this shard; None if the index has none."""
-        query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *scope_conditions_by_job(scope, tasks))
+        query = select(tasks.c.job_id).where(
+            tasks.c.shard_id == shard_id, *database.scope_conditions_by_job(scope, tasks)
+        )
         found: str | None = self.database.value(query.limit(1))
         return found
 
     def get(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> ShardView:
-        query = select(shards).where(shards.c.id == shard_id, *shard_scope_conditions(scope, shards.c.id))
+        query = select(shards).where(shards.c.id == shard_id, *database.shard_scope_conditions(scope, shards.c.id))
         return ShardView(**self.database.first_row(query, f"shard {shard_id!r}"))

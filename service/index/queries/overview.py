@@ -1,7 +1,5 @@
 """Queries of workers, the whole service, usage and costs; the cost of a Prometheus scrape is constant."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass

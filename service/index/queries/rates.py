@@ -5,8 +5,6 @@ same method, fidelity, validation and device. After the first measurement, one f
 seconds) scales all stored values. A rate's interval is the scatter of batches, or the error of a stored value.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection, Hashable, Iterable
 from dataclasses import dataclass, replace

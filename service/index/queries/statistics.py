@@ -1,7 +1,5 @@
 """Aggregates over many grasps: means, ranges and distributions of metrics, computed in the database."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

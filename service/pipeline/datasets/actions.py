@@ -4,8 +4,6 @@ The index knows which cells have a job, and a job's event names the dataset even
 can therefore continue without applying an event twice.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Iterable
@@ -44,16 +42,7 @@ from graspd.service.pipeline.job_actions import (
     resolve_network,
     usable_asset,
 )
-from graspd.service.store.records import (
-    Put,
-    add_dataset_event,
-    dataset_events,
-    job_events,
-    load_dataset,
-    load_snapshot,
-    read_record,
-    refuse_pending_deletion,
-)
+from graspd.service.store import records
 
 log = logging.getLogger(__name__)
 #: Maximum time for datasets in one round of the controller [s], so that other duties do not wait long.
@@ -96,7 +85,7 @@ def create(
         # Options are compared instead of digests, because older records lack newer options.
         if not new and (other := _describe_difference(record, hands, objects, shared)):
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
-        refuse_pending_deletion(services.store, "dataset", record.name)
+        records.refuse_pending_deletion(services.store, "dataset", record.name)
         refuse_deleted(services, wanted, connection)
         services.index.write_dataset.add(record, within=connection)
     return services.index.datasets.get(record.name), new
@@ -149,7 +138,7 @@ def take_snapshot(services: Services, name: str) -> tuple[Snapshot, bool]:
             raise ConflictError(f"dataset {name!r} was deleted just now, and there is another one; try again")
         new = put(names.dataset_snapshot_key(name, taken.digest), taken)
         if not new:
-            taken = load_snapshot(services.store, name, taken.digest)
+            taken = records.load_snapshot(services.store, name, taken.digest)
         services.index.write_dataset.add_snapshot(taken, within=connection)
     return taken, new
 
@@ -181,14 +170,14 @@ def add_object_set(
             if set(present.objects) == set(wanted):
                 return present
             after = present.digest
-            known = read_record(ObjectSet, services.store, names.object_set_key(name, after))
+            known = records.read_record(ObjectSet, services.store, names.object_set_key(name, after))
             owner, project = known.owner, known.project
             may_follow(owner, project)
         refuse_deleted(services, [(AssetKind.OBJECT, one.digest) for one in assets], connection)
         found = create_object_set(name, wanted, after=after, owner=owner, project=project)
         if not put(key := names.object_set_key(name, found.digest), found):
             # An earlier request was interrupted before it wrote the row.
-            found = read_record(ObjectSet, services.store, key)
+            found = records.read_record(ObjectSet, services.store, key)
             if not scope.can_see(found.project):
                 raise ConflictError(f"the name {name!r} is taken; take another name")
         services.index.write_dataset.add_object_set(found, within=connection)
@@ -213,16 +202,16 @@ def _usable_members(
 
 def _load_existing(services: Services, name: str) -> DatasetRecord:
     try:
-        return load_dataset(services.store, name)
+        return records.load_dataset(services.store, name)
     except NotFoundError:
         raise ConflictError(f"dataset {name!r} was deleted just now; create it again") from None
 
 
 def _add_event(
-    services: Services, name: str, what: Literal["cancelled", "retried"], connection: Connection, put: Put
+    services: Services, name: str, what: Literal["cancelled", "retried"], connection: Connection, put: records.Put
 ) -> None:
-    add_dataset_event(services.store, name, what, put=put)
-    services.index.write_dataset.set_events(name, dataset_events(services.store, name), within=connection)
+    records.add_dataset_event(services.store, name, what, put=put)
+    services.index.write_dataset.set_events(name, records.dataset_events(services.store, name), within=connection)
 
 
 def _describe_difference(
@@ -300,7 +289,7 @@ class DatasetController:
 
     def _apply_to_job(self, job: str, work: DatasetWork) -> None:
         cause = f"{work.name}/{work.events}"
-        if any(event.cause == cause for event in job_events(self._services.store, job)):
+        if any(event.cause == cause for event in records.job_events(self._services.store, job)):
             return
         act = job_actions.cancel if work.cancelled else job_actions.retry
         try:

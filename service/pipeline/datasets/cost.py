@@ -9,8 +9,6 @@
 assumed to run on devices like the measured ones.
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence

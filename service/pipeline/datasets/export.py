@@ -1,7 +1,5 @@
 """Export of a snapshot as files in a folder, with verified checksums; existing files are skipped."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Models of datasets: request, record and cost estimate. For clients, no database is imported."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Annotated, Final, Literal, Self
 

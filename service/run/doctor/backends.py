@@ -1,7 +1,5 @@
 """Checks of Redis, index and store: availability, writing and persistence."""
 
-from __future__ import annotations
-
 import secrets
 import time
 from collections.abc import Mapping
@@ -19,15 +17,8 @@ from graspd.service.index.condition import IndexCondition, read_condition
 from graspd.service.index.index import Index
 from graspd.service.index.rebuild import differences, missing_names
 from graspd.service.index.tables import shards
+from graspd.service.model import errors
 from graspd.service.model.base import first_line
-from graspd.service.model.errors import (
-    GraspdError,
-    IndexDamaged,
-    InputError,
-    NotFoundError,
-    QueueUnavailable,
-    UnavailableError,
-)
 from graspd.service.pipeline.identity import ServiceIdentity, recorded_service, service_ids
 from graspd.service.queue.connection import connect, redis_url, socket_path
 from graspd.service.queue.rq_queue import open_queue
@@ -59,7 +50,7 @@ def check_redis(settings: Settings) -> Finding:
     if not is_redis_expected(settings):
         try:
             _, rung = find_server()
-        except QueueUnavailable as error:
+        except errors.QueueUnavailable as error:
             return bad("no service runs on this data folder, and there is no Redis to start", str(error))
         return skipped(f"no service runs on this data folder; `graspd up` starts the Redis of {rung}")
     try:
@@ -158,11 +149,11 @@ _SETTLES_S: Final = 3.0
 def check_index(settings: Settings) -> Finding:
     try:
         found = read_condition(settings.resolved_index_url)
-    except IndexDamaged as error:
+    except errors.IndexDamaged as error:
         return bad(str(error), "graspd admin index rebuild: moves the index aside and fills a new one from the store")
-    except InputError as error:
+    except errors.InputError as error:
         return bad(str(error), "see the message, and GRASPD_INDEX_URL")
-    except UnavailableError as error:
+    except errors.UnavailableError as error:
         fix = "start the database; see host, user, password and database in GRASPD_INDEX_URL"
         return bad(str(error), fix if settings.index_url is not None else "check the permissions of the file")
     if found is not None:
@@ -198,7 +189,7 @@ def _index_problem(settings: Settings) -> str:
     """Return why the index should not be opened; "" if opening it changes nothing."""
     try:
         found = read_condition(settings.resolved_index_url)
-    except (InputError, UnavailableError):
+    except (errors.InputError, errors.UnavailableError):
         return "the index does not answer, or is damaged"
     if found is None:
         return "there is no index here"
@@ -221,7 +212,7 @@ def check_index_identity(settings: Settings) -> Finding:
         try:
             with closing(open_queue(settings, patience=0)) as queue:
                 redis = queue.service_id()
-        except QueueUnavailable:
+        except errors.QueueUnavailable:
             if index is None:
                 return skipped("there is no index here, and Redis does not answer")
     recorded = recorded_service(settings.data_dir.resolve())
@@ -298,7 +289,7 @@ def check_configured_store(settings: Settings) -> Finding:
         return good(f"{folder} is made at the first start, below {existing_ancestor(folder)}")
     try:
         return check_store(open_store(settings.resolved_store_url, public_endpoint=settings.store_public_endpoint))
-    except GraspdError as error:
+    except errors.GraspdError as error:
         fix = f"make room below {folder}, and let user and group write there" if folder else _CREDENTIALS
         return bad(str(error), fix)
 
@@ -338,7 +329,7 @@ def _violated_guarantee(opened: Store, key: str) -> str:
             return "an object is read differently from how it was written"
         if opened.get_range(key, 100, 50) != kept[100:150]:
             return "a byte range of an object is read wrongly"
-    except NotFoundError:
+    except errors.NotFoundError:
         return "an object is missing right after it was written"
     if opened.put(key, b"another") or opened.get(key) != kept:
         return "an object can be overwritten: create-only puts (If-None-Match: *) are not honoured"

@@ -1,7 +1,5 @@
 """Checks of an installation, with fixes. Each check has a timeout, so that a hang hides no others."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -4,8 +4,6 @@ Wrong clocks do not affect leases, which use monotonic clocks. They affect displ
 keys, the grace time of shards, and S3, which refuses requests with a difference of fifteen minutes.
 """
 
-from __future__ import annotations
-
 import json
 import secrets
 import socket

@@ -1,7 +1,5 @@
 """Checks of the machine: disk space, data folder, limits of the process."""
 
-from __future__ import annotations
-
 import os
 import re
 import resource

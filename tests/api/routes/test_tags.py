@@ -112,7 +112,7 @@ def test_a_tag_is_made_anew_after_its_end_even_if_that_broke_off(
     http: TestClient, made: ShardManifest, services: Services, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     give(http, "good", grasps=named(made.shard_id, 1))
-    monkeypatch.setattr("graspd.service.pipeline.tagging.delete_older_tag_versions", lambda *_: None)
+    monkeypatch.setattr("graspd.service.store.records.delete_older_tag_versions", lambda *_: None)
     http.delete("/v1/tags/good")
     rebuild(services.index, services.store)
     assert http.get("/v1/tags").json() == []

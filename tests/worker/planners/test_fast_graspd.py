@@ -392,7 +392,7 @@ def free(pair):
 
 def test_the_hand_around_more_of_an_object_is_tried_first(free, monkeypatch: pytest.MonkeyPatch) -> None:
     shares, orders = [], []
-    near_share, tried = Data.near_share, planner.select_by_rollout
+    near_share, tried = Data.near_share, candidates.select_by_rollout
 
     def told(data: Data, reach: float, n: int) -> np.ndarray:
         shares.append(near_share(data, reach, n))
@@ -403,8 +403,8 @@ def test_the_hand_around_more_of_an_object_is_tried_first(free, monkeypatch: pyt
         return tried(hand, obj, order, *rest, **named)
 
     monkeypatch.setattr(Data, "near_share", told)
-    monkeypatch.setattr(planner, "select_by_rollout", seen)
-    monkeypatch.setattr(planner, "NEARNESS", 1e6)
+    monkeypatch.setattr(candidates, "select_by_rollout", seen)
+    monkeypatch.setattr(candidates, "NEARNESS", 1e6)
     free(count=4, fidelity=FEW.model_copy(update={"starts": 4}))
     in_order = shares[0][orders[0]]
     assert (np.diff(in_order, axis=1) <= 0).all()

@@ -1,6 +1,4 @@
-"""Mesh files from bytes: STL, OBJ, PLY, OFF, GLB, DAE, USD. The input may be hostile: no header is trusted."""
-
-from __future__ import annotations
+"""Mesh files from bytes: STL, OBJ, PLY, OFF, GLB, DAE, USD. No header of the input is trusted."""
 
 import codecs
 import re

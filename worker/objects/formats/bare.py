@@ -2,8 +2,6 @@
 
 Colours of a PLY are those of its faces, or else of most corners of a face. They select faces but are not drawn."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from typing import Final

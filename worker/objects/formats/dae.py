@@ -3,8 +3,6 @@
 A colour is the diffuse colour of the material or the mean of its picture. The file's unit is applied. Its up axis is
 ignored, as in the viewers of ROS, for which such meshes are made."""
 
-from __future__ import annotations
-
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator

@@ -2,8 +2,6 @@
 
 A colour is the base colour of the material, times the mean of its texture if the file contains the texture."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Iterable, Iterator

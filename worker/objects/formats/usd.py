@@ -1,9 +1,7 @@
-"""OpenUSD stages (extra `usd`): geometry and physics of all prims below the default prim, read in a child process.
+"""OpenUSD stages (extra `usd`): geometry and physics below the default prim, read in a child process.
 
 The frame of an object is that of its stage: axes as authored (`upAxis` is not applied), numbers in metres by
 `metersPerUnit`. Subdivision surfaces are read as their control cage."""
-
-from __future__ import annotations
 
 import io
 import json
@@ -19,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError, MeshError
+from graspd.service.model.matter import MOST_FRICTION
 from graspd.service.model.transforms import Floats
 from graspd.service.store.assets import pack, unpack
 from graspd.service.store.usd_layers import SUFFIXES as SUFFIXES
@@ -31,8 +30,6 @@ from graspd.worker.objects.isolation import run_isolated
 MAGIC: Final = (b"#usda", b"PXR-USDC", b"PK\x03\x04")
 #: Largest size of all layers together [bytes].
 _MAX_BYTES: Final = 2**28
-#: Largest coefficient of friction of an object.
-_MOST_FRICTION: Final = 3.0
 Ints = NDArray[np.int64]
 
 
@@ -99,12 +96,12 @@ def _matter(stage: Stage) -> dict[str, float]:
     elif densities:
         found["density"] = densities[0] * stage.mass_unit / stage.unit**3
     if frictions := [shape["friction"] for shape in shapes if shape.get("friction", 0) > 0]:
-        found["friction"] = min(*frictions, _MOST_FRICTION)
+        found["friction"] = min(*frictions, MOST_FRICTION)
     return found
 
 
 def read_stage(files: Mapping[str, bytes], main: str, error: type[InputError]) -> Stage:
-    """Read a stage from its layers, or from a package (USDZ), in a child process with limits of time and memory.
+    """Read a stage from its layers or a package (USDZ), in a child process of limited time and memory.
     Raises `error`: the stage is unreadable, too large, cyclic, or refers to files outside; or usd-core is missing."""
     import_usd(error)
     try:

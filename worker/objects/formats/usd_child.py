@@ -1,9 +1,7 @@
-"""Contents of a USD stage in an isolated process: `python -m graspd.worker.objects.formats.usd_child FOLDER MAIN`.
+"""Contents of a USD stage in an isolated process, with the arguments FOLDER and MAIN.
 
 The standard output is an NPZ: `facts` (JSON) and arrays of meshes. Numbers are the file's, at the earliest time.
 Variants are those that the file selects. Matrices act on column vectors."""
-
-from __future__ import annotations
 
 import io
 import json

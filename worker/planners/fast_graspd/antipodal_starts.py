@@ -490,14 +490,14 @@ def _grips(hand: HandModel, obj: ObjectModel, device: str, wanted: Requirements)
 
 
 def _pads(hand: HandModel, known: PinchPostures) -> Floats:
-    """Return the centres of the fingertips' pads (K, F, 3) in each posture, relative to the palm's centre [m]."""
+    """Return the centres of the fingertips' pads (K, F, 3) in each posture, from the palm's centre [m]."""
     tips = list(hand.fingertips)
     pose = body_poses(hand, np.tile(IDENTITY_POSE, (len(known), 1)), hand.expand(known.q))[:, tips]
     return np.asarray(apply(pose, np.array([fingertip_pad(hand, tip).centre for tip in tips])) - hand.palm.centre)
 
 
 def _is_within_reach(obj: ObjectModel, middle: Floats, back: Floats, longest: float) -> NDArray[np.bool_]:
-    """Return a mask (P,) of pairs with less of the object than `longest` [m] in the direction `back` (3,), behind them.
+    """Return a mask (P,) of pairs with less object than `longest` [m] behind them, along `back` (3,).
     `middle` (P, 3) is relative to the centre of mass [m]. All pairs, if there is none."""
     from scipy.spatial.distance import cdist  # only cones need it
 

@@ -2,8 +2,6 @@
 
 A batch stops when it is cancelled or fails; the other batches continue."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Device data that batches of one hand, object and fidelity share, cached between batches."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

@@ -22,23 +22,8 @@ from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet, join_grasp_sets
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fast_graspd import scene_starts, starts
+from graspd.worker.planners.fast_graspd import candidates, scene_starts, starts
 from graspd.worker.planners.fast_graspd.batches import Batches, finalist_count
-from graspd.worker.planners.fast_graspd.candidates import (
-    FRICTION,
-    GOOD,
-    GOOD_IN_SCENES,
-    NEAR_M,
-    NEARNESS,
-    SCENE_FRICTION,
-    TOGETHER,
-    Refinements,
-    grasps_of_state,
-    merits,
-    posture_of,
-    rank_hands,
-    select_by_rollout,
-)
 from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
 from graspd.worker.planners.fast_graspd.schedule import AROUND, DILATION, WarmStart, coarse_schedule, fine_schedule
 from graspd.worker.planners.fast_graspd.starts import NO_PLACE, Probe
@@ -68,11 +53,11 @@ STANDS: Final = 1.99
 #: Free grasps with larger scores are retried; one limit for each attempt. Grasps that may slip at half friction exceed
 #: the first limit; grasps with a finger off the object also exceed the second. Later attempts are as productive as the
 #: first. They hardly change the yield per second, but fewer grasps of hard pairs of hand and object fail.
-FREE: Final = (GOOD, STANDS, *(FAILED,) * 18)
+FREE: Final = (candidates.GOOD, STANDS, *(FAILED,) * 18)
 #: Grasps in scenes with larger scores are retried; one limit for each attempt. A grasp with a finger off the object
 #: exceeds only the first limit; a grasp that fails only at half friction exceeds the first five. Five attempts instead
 #: of two raise the share that lifts at half friction from .63 to .67 at 3 % more time (Allegro, 12 objects, own mass).
-IN_SCENES: Final = (GOOD_IN_SCENES, *(1.0,) * 4, FAILED)
+IN_SCENES: Final = (candidates.GOOD_IN_SCENES, *(1.0,) * 4, FAILED)
 #: Range of the distance at which a digit that must touch is closed [m].
 MUST_TOUCH_M: Final = (0.001, 0.06)
 #: Largest number of attempts of one grasp at once.
@@ -219,8 +204,8 @@ class _Launch:
 
     def merits(self, state: HandState, losses: Floats, depths: Floats | None = None) -> Floats:
         hand, obj, device = self.pair_on_device()
-        friction = FRICTION if self.batches.placed is None else SCENE_FRICTION
-        return merits(hand, obj, state, losses, depths, friction=friction, device=device)
+        friction = candidates.FRICTION if self.batches.placed is None else candidates.SCENE_FRICTION
+        return candidates.merits(hand, obj, state, losses, depths, friction=friction, device=device)
 
     def closed(self, state: HandState, rows: Rows) -> HandState:
         """Close fingers that stand off the object; `rows` (n,) are the grasps of the hands.
@@ -230,7 +215,7 @@ class _Launch:
             return state
         hand, obj, device = self.pair_on_device()
         off_m = MUST_TOUCH_M if required else STANDS_OFF_M
-        posture = posture_of(hand, obj, state)
+        posture = candidates.posture_of(hand, obj, state)
         grasp = close_fingers(hand, obj, posture, self.placed(rows), off_m=off_m, device=device)
         return HandState(state.pivot, state.rotation, hand.reduce(grasp.joint_positions))
 
@@ -239,7 +224,7 @@ class _Launch:
         if self.batches.placed is None or not self.batches.has_rollout:
             return np.zeros(len(state.pivot), bool)
         hand, obj, device = self.pair_on_device()
-        return fingers_off_object(hand, obj, posture_of(hand, obj, state), device=device)
+        return fingers_off_object(hand, obj, candidates.posture_of(hand, obj, state), device=device)
 
     def infeasible(self, state: HandState, depths: Floats, rows: Rows) -> NDArray[np.bool_]:
         """Return a mask (n,) of hands of grasps `rows` that get no rollout; `depths` (n,) [m].
@@ -247,7 +232,7 @@ class _Launch:
         if not self.batches.has_rollout:
             return np.zeros(len(depths), bool)
         hand, obj, device = self.pair_on_device()
-        posture, wanted = posture_of(hand, obj, state), self.batches.requirements
+        posture, wanted = candidates.posture_of(hand, obj, state), self.batches.requirements
         links = touching_links(hand, obj, posture, device=device)
         bad = (depths > 1e-3 * MAX_PENETRATION_MM) | (links < max(MIN_CONTACT_LINKS, wanted.links))
         if wanted.is_set and not bad.all():
@@ -338,21 +323,21 @@ def _optimise_part(launch: _Launch, begun: _Starts, beat: Floats | None = None) 
     if last < fidelity.starts or (batches.has_rollout and fidelity.starts > 1):
         merit = launch.merits(state, losses)
         if placed is None:
-            merit -= NEARNESS * data.near_share(NEAR_M, len(state.pivot))
+            merit -= candidates.NEARNESS * data.near_share(candidates.NEAR_M, len(state.pivot))
         else:
             merit += scene_starts.obstruction(
                 launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts))
             )
-        order = rank_hands(merit, n)[:, :last]
+        order = candidates.rank_hands(merit, n)[:, :last]
     fine_phase = _FinePhase(launch, rows, state, losses, curve)
     if batches.has_rollout:
 
         def rollout(grasps: GraspSet, which: Rows, beat: Floats) -> Floats:
             return batches.rollout(grasps, rows[which], beat)
 
-        together = 1 if placed is None else TOGETHER
+        together = 1 if placed is None else candidates.TOGETHER
         device = pair.hand.device
-        taken = select_by_rollout(
+        taken = candidates.select_by_rollout(
             hand, obj, order, fine_phase.refine, placed, rollout, beat=beat, together=together, device=device
         )
         found, score = taken.joined(), taken.score
@@ -361,7 +346,7 @@ def _optimise_part(launch: _Launch, begun: _Starts, beat: Floats | None = None) 
             score = np.where(off & (score < STANDS), STANDS + 1e-3 * score, score)
         return LaunchPart(rows, taken.state, taken.losses, score, curve, found)
     refined = fine_phase.refine(np.sort(order, axis=1), np.arange(n))
-    winners = rank_hands(refined.merit, n)[:, 0] if last > 1 else np.arange(n)
+    winners = candidates.rank_hands(refined.merit, n)[:, 0] if last > 1 else np.arange(n)
     return LaunchPart(rows, refined.state[winners], refined.losses[winners], refined.merit[winners], curve)
 
 
@@ -409,7 +394,7 @@ def _run_attempts(launch: _Launch, rows: Rows, attempt: Rows, merit: Floats, run
 def _add_postures(launch: _Launch, part: LaunchPart) -> LaunchPart:
     hand, obj, device = launch.pair_on_device()
     placed = launch.placed(part.rows)
-    return replace(part, grasps=grasps_of_state(hand, obj, part.state, part.loss, placed, device=device))
+    return replace(part, grasps=candidates.grasps_of_state(hand, obj, part.state, part.loss, placed, device=device))
 
 
 @dataclass
@@ -423,7 +408,7 @@ class _FinePhase:
     curve: list[Floats]
     """Loss curve; only the first call of `refine` continues it."""
 
-    def refine(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Refinements:
+    def refine(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> candidates.Refinements:
         launch, flat = self.launch, rows.ravel()
         fidelity, mine = launch.batches.fidelity, self.rows[which]
         state, losses = self.state[flat], self.losses[flat]
@@ -440,7 +425,7 @@ class _FinePhase:
         # Without iterations the projection only measures the depth of each hand.
         state, depths = Projection(launch.fine, data, options).run(state, fidelity.polish_iterations)
         merit = launch.merits(state, losses, depths) if rows.shape[1] > 1 else np.zeros(len(flat))
-        return Refinements(
+        return candidates.Refinements(
             state,
             losses,
             merit,
@@ -494,7 +479,7 @@ def grasps_of(
     else:
         loss = np.concatenate([part.loss for part in parts])
         state = HandState.concatenate([part.state for part in parts])
-        grasps = grasps_of_state(hand, obj, state, loss, placed, device=device)
+        grasps = candidates.grasps_of_state(hand, obj, state, loss, placed, device=device)
     attempts = int(sum(part.attempts.sum() for part in parts))
     info = {"loss_curve": np.round(curve, 5).tolist(), "chunk": CHUNK}
     return replace(grasps, seconds=seconds, info=info, attempts=attempts)

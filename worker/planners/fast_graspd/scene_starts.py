@@ -6,8 +6,6 @@ Before the fine phase `obstruction` tests whether each hand can leave its grasp,
 on the lift. A hand hooked around an edge holds well but cannot reach its grasp. A hand close below a board
 cannot lift."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -28,6 +26,7 @@ from graspd.worker.hands.digits import finger_of_body
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.mesh_geometry import points_on_triangles
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.fast_graspd import starts
 from graspd.worker.planners.fast_graspd.antipodal_starts import (
     NEAR_M,
     AntipodalHands,
@@ -36,16 +35,6 @@ from graspd.worker.planners.fast_graspd.antipodal_starts import (
     select_draws,
 )
 from graspd.worker.planners.fast_graspd.candidates import posture_of
-from graspd.worker.planners.fast_graspd.starts import (
-    CLEAR,
-    POSTURE_NOISE,
-    TILT,
-    Probe,
-    draw_at_pose,
-    frames_about,
-    hands_at_distances,
-    store_states,
-)
 from graspd.worker.planners.fitting import region_points, surface_of
 from graspd.worker.planners.port import NoStartFound
 from graspd.worker.planners.requirements import LIKE_M, NOTHING, Requirements
@@ -131,7 +120,7 @@ def clear_scene_starts(
     to the pads. In a narrow scene some grasps find no clear start; the batch still contains them, as blocked grasps.
     `ways` are the `free_directions` of each scene."""
     hand, obj = model.hand.model, model.obj.model
-    probe = Probe(model, len(generators), room=ROOM)
+    probe = starts.Probe(model, len(generators), room=ROOM)
     used = set(placed.index.tolist())
     openings = {s: Openings.in_scene(hand, obj, scene, wanted) for s, scene in enumerate(placed.scenes) if s in used}
     scene, at_pose = np.repeat(placed.index, each), wanted.like is not None
@@ -144,7 +133,7 @@ def clear_scene_starts(
     depth, beside = np.full(count, np.inf), np.where(reaching, np.inf, 0.0)
     order, least_beside = around.select_draws(uniform, scene, reaching, placed)
     for number in range(DRAWS):
-        redraw = depth > CLEAR
+        redraw = depth > starts.CLEAR
         if number < REACHES:
             redraw |= reaching & (beside > NEAR_M) & (least_beside[:, number] < beside)
         rows = np.flatnonzero(redraw)
@@ -158,19 +147,21 @@ def clear_scene_starts(
         states, across_pairs = around.hands_of_draws(uniform[rows, numbers], normal[rows, number], scene[rows], reach)
         off = _raise_draws(states, across_pairs, np.flatnonzero(reach), placed, scene[rows], probe)
         worth = off < beside[rows, None]
-        worth[~reach | (depth[rows] > CLEAR)] = True
+        worth[~reach | (depth[rows] > starts.CLEAR)] = True
         worth &= not at_pose or np.array(RETREATS) <= LIKE_M
         found = _depths(probe, states, placed, scene[rows], worth)
         # Select the nearest clear distance, or else the least deep one.
-        clear = found <= CLEAR
+        clear = found <= starts.CLEAR
         pick = np.where(clear.any(axis=1), clear.argmax(axis=1), found.argmin(axis=1))
         at = np.arange(len(rows)), pick
         least = found[at]
-        better = np.where(least <= CLEAR, (depth[rows] > CLEAR) | (off[at] < beside[rows]), least < depth[rows])
+        better = np.where(
+            least <= starts.CLEAR, (depth[rows] > starts.CLEAR) | (off[at] < beside[rows]), least < depth[rows]
+        )
         taken = states[(at[0] * len(RETREATS) + pick)[better]]
         depth[rows[better]] = least[better]
-        beside[rows[better]] = np.where(least <= CLEAR, off[at], beside[rows])[better]
-        store_states(best, rows[better], taken)
+        beside[rows[better]] = np.where(least <= starts.CLEAR, off[at], beside[rows])[better]
+        starts.store_states(best, rows[better], taken)
     return best, depth
 
 
@@ -182,7 +173,7 @@ def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], numbe
 
 
 def _depths(
-    probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], worth: NDArray[np.bool_]
+    probe: starts.Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], worth: NDArray[np.bool_]
 ) -> Floats:
     """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,); inf if not computed.
     Only retreats with `worth` (n, len(RETREATS)) are computed, from the farthest inwards, until one is not clear.
@@ -195,15 +186,15 @@ def _depths(
             probe.data.set_scenes(scene[left])
             some = states[left * len(RETREATS) + k]
             found[left, k] = probe.depths(some)
-            clear = np.flatnonzero(found[left, k] <= CLEAR)
+            clear = np.flatnonzero(found[left, k] <= starts.CLEAR)
             lack = _missing_mounting_clearance(probe, some[clear], placed, scene[left[clear]], exact=True)
             found[left[clear], k] = np.maximum(found[left[clear], k], lack)
-            open_[left] = found[left, k] <= CLEAR
+            open_[left] = found[left, k] <= starts.CLEAR
     return found
 
 
 def _missing_mounting_clearance(
-    probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], *, exact: bool
+    probe: starts.Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], *, exact: bool
 ) -> Floats:
     """Return by how much (n,) mountings in scenes (n,) miss the margin plus `ROOM` [m]; at least 0."""
     hand, obj = probe.model.hand.model, probe.model.obj.model
@@ -217,7 +208,7 @@ def _raise_draws(
     rows: NDArray[np.intp],
     placed: PlacedGrasps,
     scene: NDArray[np.intp],
-    probe: Probe,
+    probe: starts.Probe,
 ) -> Floats:
     """Raise draws `rows` in scenes (n,), at all retreats, by the clearance missing at the nearest retreat.
     Return the distance (n, len(RETREATS)) of their pairs from the middle of the pads [m], 0 for other draws. Retreat
@@ -281,14 +272,14 @@ class _SceneDraws:
                     uniform[rows], normal[rows], self.ways[s]
                 )
         pivot = pivot[:, None] + np.array(RETREATS)[None, :, None] * away[:, None]
-        return hands_at_distances(pivot, rotation, q), reaching
+        return starts.hands_at_distances(pivot, rotation, q), reaching
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Place palms towards random surface points, or at the demonstrated wrist pose.
         Return pivots, rotations, dofs, directions of retreat."""
         hand, obj = self.hand, self.obj
         if self.wanted.like is not None:
-            state, approach = draw_at_pose(hand, obj.centre_of_mass, self.wanted.like, normal)
+            state, approach = starts.draw_at_pose(hand, obj.centre_of_mass, self.wanted.like, normal)
             return state.pivot, state.rotation, state.q, -approach
         corners, normals, sums = surface_of(obj)
         face = np.minimum(np.searchsorted(sums, uniform[:, 0]), len(sums) - 1)
@@ -297,12 +288,12 @@ class _SceneDraws:
             places, faces = region_points(obj, self.wanted.region)
             chosen = (uniform[:, 0] * len(places)).astype(int)
             point, face = places[chosen], faces[chosen]
-        away = _tilted(normals[face], TILT * normal[:, :2])
+        away = _tilted(normals[face], starts.TILT * normal[:, :2])
         away = np.array([_turned(a, ways, t) for a, t in zip(away, uniform[:, 5:7], strict=True)])
-        align = frames_about(-away) @ frames_about(hand.palm.approach).T
+        align = starts.frames_about(-away) @ starts.frames_about(hand.palm.approach).T
         roll = quat_from_axis_angle(-away, 2 * np.pi * uniform[:, 3])
         rotation = quat_multiply(roll, quat_from_matrix(align))
-        q = np.clip(hand.preshape + POSTURE_NOISE * hand.span * normal[:, 2:], hand.lower, hand.upper)
+        q = np.clip(hand.preshape + starts.POSTURE_NOISE * hand.span * normal[:, 2:], hand.lower, hand.upper)
         gap = GAP[0] + (GAP[1] - GAP[0]) * uniform[:, 4:5]
         return point - obj.centre_of_mass + gap * away, rotation, q, away
 
@@ -322,7 +313,7 @@ def _turned(away: Floats, ways: Floats, random: Floats) -> Floats:
 
 def _tilted(normals: Floats, angles: Floats) -> Floats:
     """Return unit vectors (n, 3): normals turned about two perpendicular axes by `angles` (n, 2) [rad]."""
-    axis = np.einsum("nij,nj->ni", frames_about(normals)[..., :2], angles)
+    axis = np.einsum("nij,nj->ni", starts.frames_about(normals)[..., :2], angles)
     angle = np.linalg.norm(axis, axis=1, keepdims=True)
     unit = axis / np.maximum(angle, 1e-12)
     return np.asarray(normals * np.cos(angle) + np.cross(unit, normals) * np.sin(angle))
@@ -366,7 +357,7 @@ def _retreat_obstruction(model: Model, state: HandState, scenes: NDArray[np.inte
         np.tile(state.rotation, (len(OUT), 1)),
         np.clip(np.concatenate(opened), hand.lower, hand.upper),
     )
-    probe = Probe(model, len(OUT) * n)
+    probe = starts.Probe(model, len(OUT) * n)
     probe.data.set_scenes(np.tile(scenes, len(OUT)))
     probe.depths(states)
     found = probe.data.depths
@@ -382,7 +373,7 @@ def _lift_obstruction(model: Model, state: HandState, placed: PlacedGrasps) -> F
     n = len(state.pivot)
     up = np.array([scene.up for scene in placed.scenes])[placed.index]
     pivot = np.concatenate([state.pivot + share * RISE_M * up for share in UP])
-    probe = Probe(model, len(UP) * n)
+    probe = starts.Probe(model, len(UP) * n)
     probe.data.set_scenes(np.tile(placed.index, len(UP)))
     probe.depths(HandState(pivot, np.tile(state.rotation, (len(UP), 1)), np.tile(state.q, (len(UP), 1))))
     return np.asarray(probe.data.depths.obstacles.numpy()[: len(UP) * n].reshape(len(UP), n).max(axis=0), float)

@@ -1,8 +1,6 @@
 """Weights per iteration, and the interface for another method that proposes starts.
 The coarse phase shrinks the dilation; the fine phase brings the hand into contact."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final, Protocol
 

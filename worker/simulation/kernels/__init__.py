@@ -5,8 +5,6 @@ that is written, other outputs. Names end in `_in` or `_out`; an `_inout` argume
 output. Quaternions are x y z w in these modules only. Each module compiles on first use and is cached on disk. The
 object frame of all kernels has its origin at the centre of mass."""
 
-from __future__ import annotations
-
 import threading
 from importlib import import_module
 from typing import Final

@@ -1,4 +1,4 @@
-"""Drake on the CPU (Tedrake et al. 2019): contact as a convex problem with lagged friction (Castro et al. 2023)."""
+"""Drake on the CPU (Tedrake et al. 2019): convex contact with lagged friction (Castro et al. 2023)."""
 
 from __future__ import annotations
 
@@ -7,22 +7,10 @@ from collections.abc import Iterable
 from typing import Any, Final
 
 import numpy as np
+from pydrake import geometry
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.geometry import (
-    AddCompliantHydroelasticProperties,
-    AddContactMaterial,
-    AddRigidHydroelasticProperties,
-    Box,
-    Capsule,
-    CollisionFilterDeclaration,
-    Convex,
-    Cylinder,
-    GeometrySet,
-    HalfSpace,
-    ProximityProperties,
-    Sphere,
-)
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody import tree
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import (
     AddMultibodyPlantSceneGraph,
@@ -30,14 +18,6 @@ from pydrake.multibody.plant import (
     CoulombFriction,
     DiscreteContactApproximation,
     ExternallyAppliedSpatialForce,
-)
-from pydrake.multibody.tree import (
-    FixedOffsetFrame,
-    PdControllerGains,
-    PrismaticJoint,
-    RevoluteJoint,
-    RotationalInertia,
-    SpatialInertia,
 )
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -57,7 +37,7 @@ MODULUS: Final = 1e7
 EDGE_M: Final = 0.005
 DISSIPATION: Final = 50.0  # [s/m] (Hunt and Crossley 1975): no body bounces faster than 2 cm/s
 #: Gain and damping of the six joints that carry the root: sliding [N/m, N s/m] and turning [N m/rad, N m s/rad].
-ROOT_GAINS: Final = (PdControllerGains(p=1e5, d=1e3), PdControllerGains(p=1e3, d=10.0))
+ROOT_GAINS: Final = (tree.PdControllerGains(p=1e5, d=1e3), tree.PdControllerGains(p=1e3, d=10.0))
 _ROOT_AXES: Final = ((0, 0), (0, 1), (0, 2), (1, 2), (1, 1), (1, 0))  # (turning, axis): x y z, then yaw, pitch, roll
 _ORIGIN: Final = RigidTransform()
 
@@ -96,20 +76,20 @@ class DrakeSimulation:
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
         plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
         plain, soft, rigid = (_surface(model.friction) for _ in range(3))
-        AddCompliantHydroelasticProperties(EDGE_M, MODULUS, soft)
-        AddRigidHydroelasticProperties(rigid)
-        self._base = plant.AddFrame(FixedOffsetFrame("base", plant.world_frame(), _ORIGIN))
+        geometry.AddCompliantHydroelasticProperties(EDGE_M, MODULUS, soft)
+        geometry.AddRigidHydroelasticProperties(rigid)
+        self._base = plant.AddFrame(tree.FixedOffsetFrame("base", plant.world_frame(), _ORIGIN))
         # Flat pads need areas: on a single point an object turns. With more drives, areas cost four times as much.
         self._links = self._add_hand(model, soft if len(model.drives) <= MAX_DOFS else plain)
         self._object = plant.AddRigidBody("object", _inertia(model.obj.mass, np.zeros(3), model.obj.inertia))
         for corners in model.obj.pieces:
-            self._add_shape(self._object, soft, Convex(corners.T, "piece"))
+            self._add_shape(self._object, soft, geometry.Convex(corners.T, "piece"))
         for support in model.supports:
             self._add_shape(plant.world_body(), rigid, *_support(support))
         manager = scene.collision_filter_manager()
-        shapes = [GeometrySet(plant.GetCollisionGeometriesForBody(link)) for link in self._links]
+        shapes = [geometry.GeometrySet(plant.GetCollisionGeometriesForBody(link)) for link in self._links]
         for a, b in model.ignored:
-            manager.Apply(CollisionFilterDeclaration().ExcludeBetween(shapes[a], shapes[b]))
+            manager.Apply(geometry.CollisionFilterDeclaration().ExcludeBetween(shapes[a], shapes[b]))
         plant.Finalize()
         self._diagram = builder.Build()
         self._simulator = Simulator(self._diagram)
@@ -206,8 +186,8 @@ class DrakeSimulation:
         parent = self._base
         for k, (turning, axis) in enumerate(_ROOT_AXES):
             last = k == len(_ROOT_AXES) - 1
-            child = links[0] if last else plant.AddRigidBody(f"root{k}", SpatialInertia.Zero())
-            kind = RevoluteJoint if turning else PrismaticJoint
+            child = links[0] if last else plant.AddRigidBody(f"root{k}", tree.SpatialInertia.Zero())
+            kind = tree.RevoluteJoint if turning else tree.PrismaticJoint
             joint = plant.AddJoint(kind(f"root{k}", parent, child.body_frame(), np.eye(3)[axis], damping=0.0))
             plant.AddJointActuator(joint.name(), joint).set_controller_gains(ROOT_GAINS[turning])
             self._joints.append(joint)
@@ -222,8 +202,8 @@ class DrakeSimulation:
 
     def _add_joint(self, links: list[Any], link: Link, b: int, drive: Drive | None) -> Any:
         plant = self._plant
-        frame = FixedOffsetFrame(f"joint{b}", links[link.parent].body_frame(), _transform(link.origin))
-        kind = RevoluteJoint if link.joint is JointType.REVOLUTE else PrismaticJoint
+        frame = tree.FixedOffsetFrame(f"joint{b}", links[link.parent].body_frame(), _transform(link.origin))
+        kind = tree.RevoluteJoint if link.joint is JointType.REVOLUTE else tree.PrismaticJoint
         frames = plant.AddFrame(frame), links[b].body_frame()
         joint = plant.AddJoint(kind(f"joint{b}", *frames, link.axis, *link.limits, link.damping))
         # Joints without a drive of their own have an actuator for the rotor's inertia, too.
@@ -231,11 +211,11 @@ class DrakeSimulation:
         actuator.set_default_gear_ratio(1.0)
         actuator.set_default_rotor_inertia(link.armature)
         if drive is not None:
-            actuator.set_controller_gains(PdControllerGains(p=drive.gain, d=0.0))
+            actuator.set_controller_gains(tree.PdControllerGains(p=drive.gain, d=0.0))
         return joint
 
     def _add_shape(self, body: Any, surface: Any, shape: Any, pose: Any = _ORIGIN) -> None:
-        """Add a shape; two shapes touch over an area if both surfaces are hydroelastic and one of them is soft."""
+        """Add a shape; two shapes touch over an area if both are hydroelastic and one of them is soft."""
         name = f"shape{self._plant.num_collision_geometries()}"
         self._plant.RegisterCollisionGeometry(body, pose, shape, name, surface)
 
@@ -245,8 +225,10 @@ def _is_simple(drive: Drive) -> bool:
 
 
 def _surface(friction: float) -> Any:
-    surface, coulomb = ProximityProperties(), CoulombFriction(friction, friction)
-    AddContactMaterial(dissipation=DISSIPATION, point_stiffness=STIFFNESS, friction=coulomb, properties=surface)
+    surface, coulomb = geometry.ProximityProperties(), CoulombFriction(friction, friction)
+    geometry.AddContactMaterial(
+        dissipation=DISSIPATION, point_stiffness=STIFFNESS, friction=coulomb, properties=surface
+    )
     return surface
 
 
@@ -257,20 +239,20 @@ def _transform(pose: Iterable[float]) -> Any:
 
 def _inertia(mass: float, centre: Floats, inertia: Floats) -> Any:
     moments, products = np.diag(inertia), inertia[[0, 0, 1], [1, 2, 2]]
-    return SpatialInertia.MakeFromCentralInertia(mass, centre, RotationalInertia(*moments, *products))
+    return tree.SpatialInertia.MakeFromCentralInertia(mass, centre, tree.RotationalInertia(*moments, *products))
 
 
 def _shape(piece: ConvexPiece) -> tuple[Any, Any]:
     """Return a piece's shape and its pose in the link's frame."""
     if piece.kind == "hull":
-        return Convex(piece.vertices.T, "piece"), _ORIGIN
-    kinds = {"box": Box, "sphere": Sphere, "cylinder": Cylinder, "capsule": Capsule}
+        return geometry.Convex(piece.vertices.T, "piece"), _ORIGIN
+    kinds = {"box": geometry.Box, "sphere": geometry.Sphere, "cylinder": geometry.Cylinder, "capsule": geometry.Capsule}
     return kinds[piece.kind](*piece.size), _transform(piece.pose)
 
 
 def _support(support: Obstacle) -> tuple[Any, Any]:
     """Return a support's shape and its pose in the world."""
     if len(support.corners):
-        return Convex(support.corners.T, "support"), _ORIGIN
+        return geometry.Convex(support.corners.T, "support"), _ORIGIN
     normal, offset = support.planes[0, :3], support.planes[0, 3]
-    return HalfSpace(), HalfSpace.MakePose(normal, offset * normal)
+    return geometry.HalfSpace(), geometry.HalfSpace.MakePose(normal, offset * normal)

@@ -1,4 +1,4 @@
-"""PhysX 5 on the CPU, through SAPIEN (Xiang et al. 2020). The hand is an articulation in reduced coordinates."""
+"""PhysX 5 on the CPU, through SAPIEN (Xiang et al. 2020); the hand has reduced coordinates."""
 
 from __future__ import annotations
 
@@ -116,14 +116,10 @@ class PhysxSimulation:
         self._hand.qvel = speed
         hand, push, step, pulls = self._hand, self._object.add_force_torque, self._system.step, self._pulls
         # Springs act explicitly: in PhysX's own drives, damping larger than inertia biases the resting position.
-        stretched, stiffness, back = (
-            pulls @ self._row(offset, joints) * self._gain,
-            self._gain[:, None] * pulls,
-            pulls.T,
-        )
+        stretched, stiffness = pulls @ self._row(offset, joints) * self._gain, self._gain[:, None] * pulls
         low, high, still = -self._effort, self._effort, np.zeros(3)
         for _ in range(steps):
-            hand.qf = back @ np.minimum(np.maximum(stretched - stiffness @ hand.qpos, low), high)
+            hand.qf = pulls.T @ np.minimum(np.maximum(stretched - stiffness @ hand.qpos, low), high)
             push(force, still)
             step()
         return steps

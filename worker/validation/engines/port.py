@@ -1,10 +1,8 @@
-"""Port of physics engines: what an adapter receives, and what it must do. Units are SI; quaternions are w x y z.
+"""Port of physics engines: input and duties of an adapter. Units are SI; quaternions are w x y z.
 
 The protocol (`worker.validation.engines.trial`) is written once, on top of this port. An adapter builds the model,
 follows targets, applies one force, and returns the object's pose. No engine has gravity: the weight of the object is
 part of the force, and the hand has no weight."""
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,7 +45,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Coupling:
-    """Mimic joint: position of `follower` = ratio * position of `leader` + offset. Only the leader has a drive."""
+    """Mimic joint: position of `follower` = ratio * position of `leader` + offset. The leader is driven."""
 
     follower: int
     leader: int
@@ -57,7 +55,7 @@ class Coupling:
 
 @dataclass(frozen=True)
 class RigidObject:
-    """The free object. Its body frame is at the centre of mass, with the axes of the object's (mesh) frame."""
+    """The free object. Its body frame is at the centre of mass, with the axes of the mesh's frame."""
 
     pieces: tuple[Floats, ...]  # corners (V, 3) of convex pieces in the body frame
     mass: float
@@ -116,7 +114,7 @@ class Simulation(Protocol):
     """One model in one engine. It owns its state: one thread at a time."""
 
     def reset(self, object_pose: Floats, root: Floats, joints: Floats) -> None:
-        """Place the object (7,), the root (7,) and the joints (L,) at rest, with these as targets, without force."""
+        """Place object (7,), root (7,) and joints (L,) at rest, with these as targets, without force."""
 
     def run(self, root: Floats, joints: Floats, force: Floats, seconds: float) -> int:
         """Simulate under constant targets and force; the root may move to its target evenly over the time.

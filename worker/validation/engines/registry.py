@@ -2,8 +2,6 @@
 
 The module of an engine has its name and a constant `ENGINE`; MuJoCo is part of the validator."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -118,7 +116,7 @@ def validate_with_engine(
 
 
 def _geometry(test: Test, grasps: GraspSet, row: int) -> str:
-    """Return why the start of a trial is rejected by geometry, the same for all engines; empty if it is not."""
+    """Return why geometry rejects the start of a trial, the same for all engines; empty if it does not."""
     if isinstance(test, Lift):
         outcome = test.check_approach(grasps, row).outcome
         return "" if outcome is LiftOutcome.NOT_TRIED else outcome.name.lower().replace("_", " ")

@@ -6,8 +6,6 @@ failures are final, at level `fast` clear verdicts of both kinds. Other levels a
 The validator's model is compiled once; postures, commands and pushes are arrays. Worlds take grasps from a queue on the
 device until it is empty, and one graph serves any number of grasps."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import logging

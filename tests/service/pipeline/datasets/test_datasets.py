@@ -26,7 +26,14 @@ from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.export import Fetch, export_shards, path_of
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.fidelity_choice import FidelityResolver
-from graspd.service.store.records import job_events, load_dataset, publish_record, put_record, scene_chart_kind
+from graspd.service.store.records import (
+    job_events,
+    load_dataset,
+    load_snapshot,
+    publish_record,
+    put_record,
+    scene_chart_kind,
+)
 from graspd.service.store.store import open_store
 from tests.fakes import finish, plan_all, record_of
 from tests.service.pipeline.datasets.makers import add_asset, cells_of, done, fail, jobs_of, wanted
@@ -253,7 +260,7 @@ def test_the_same_shards_are_the_same_snapshot(services: Services) -> None:
     assert new and last.complete and last.digest != first.digest
     assert [(shard.hand, shard.object) for shard in last.shards][1:3] == [("gripper", "cube"), ("claw", "ball")]
     assert last.size_bytes == sum(services.store.size(shard.key) for shard in last.shards)
-    assert actions.load_snapshot(services.store, "grasps", first.digest) == first
+    assert load_snapshot(services.store, "grasps", first.digest) == first
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Update of generated tables in the docs, and of keyword stubs: `python -m graspd.service.docs`."""
+"""Update of generated tables in the docs, and of keyword stubs: `python -m docs.tables`."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _cells(row: OptionRow) -> tuple[str, str, str]:
 
 def keywords_stub() -> str:
     parts = [
-        '"""Keyword arguments of the options, written by `python -m graspd.service.docs`."""\n',
+        '"""Keyword arguments of the options, written by `python -m docs.tables`."""\n',
         "from collections.abc import Mapping, Sequence",
         "from pathlib import Path",
         "from typing import Any, Literal, TypedDict",
