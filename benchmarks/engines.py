@@ -23,10 +23,9 @@ from graspd.studies.engines import compare_engines, summarise
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.validation.engines.registry import EngineVerdicts, check_engines
 
-OBJECTS: Final = ("006_mustard_bottle", "024_bowl", "025_mug", "035_power_drill", "077_rubiks_cube")
 HEAD: Final = """# Engines
 
-`python -m benchmarks.engines DATA`: verdicts of several engines on the same candidates, which no validation selected.
+`python -m benchmarks.engines DATA --grasps {grasps} --engines {engines}`: verdicts of several engines on the same candidates, which no validation selected.
 {grasps} candidates per hand, object and kind of scene; objects: {listed}; seed {seed}. *Half*: half the friction.
 *Both*, *only first*, *only second*: numbers of grasps that hold. κ: agreement beyond chance (Cohen). *First held:
 second holds*: share of the first engine's grasps that the second engine holds. Core-ms are CPU time per verdict on a
@@ -44,12 +43,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--hands", nargs="+", default=["allegro", "barrett", "shadow"])
-    parser.add_argument("--objects", nargs="+", default=OBJECTS)
+    parser.add_argument("--objects", nargs="+", help="default: all")
     parser.add_argument("--grasps", type=int, default=16)
     parser.add_argument("--engines", default="mujoco,physx")
     parser.add_argument("--seed", type=int, default=1500)
     parser.add_argument("--page", type=Path)
     given = parser.parse_args()
+    given.objects = given.objects or sorted(path.parent.name for path in given.data.glob("objects/*/clean.stl"))
     engines = check_engines(given.engines.split(","))
     found: dict[tuple[str, str, str], list[list[EngineVerdicts]]] = {}
     with TemporaryDirectory() as work:

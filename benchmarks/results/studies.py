@@ -218,7 +218,7 @@ STUDIES: Final = (
         "engines",
         "verdicts of several engines on the same candidates",
         ("results/engines.md",),
-        ("python -m benchmarks.engines DATA --grasps 8 --engines mujoco,physx,drake --page OUT/results/engines.md",),
+        ("python -m benchmarks.engines DATA --grasps 18 --engines mujoco,physx,drake --page OUT/results/engines.md",),
         (
             "python -m benchmarks.engines DATA --hands barrett --objects 077_rubiks_cube --grasps 2 "
             "--engines mujoco,physx,drake --page OUT/results/engines.md",
