@@ -25,7 +25,8 @@ from graspd.worker.validation.engines.registry import EngineVerdicts, check_engi
 
 HEAD: Final = """# Engines
 
-`python -m benchmarks.engines DATA --grasps {grasps} --engines {engines}`: verdicts of several engines on the same candidates, which no validation selected.
+`python -m benchmarks.engines DATA --grasps {grasps} --engines {engines}`: verdicts of several
+engines on the same candidates, which no validation selected.
 {grasps} candidates per hand, object and kind of scene; objects: {listed}; seed {seed}. *Half*: half the friction.
 *Both*, *only first*, *only second*: numbers of grasps that hold. κ: agreement beyond chance (Cohen). *First held:
 second holds*: share of the first engine's grasps that the second engine holds. Core-ms are CPU time per verdict on a
