@@ -20,7 +20,7 @@ from graspd.exchange.plan import ExportSummary, prim_name
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, pose_to_matrix
 from graspd.service.store.shards import Shard, read_shard
-from graspd.service.store.usd_layers import SUFFIXES
+from graspd.service.store.usd_layers import LAYERS
 from graspd.worker.files.provenance import parse_options_attribute
 from graspd.worker.files.subsets import select_grasps
 from graspd.worker.grasps import Posture
@@ -82,7 +82,7 @@ def write_simready(source: Path, grasps: Sequence[Path], out: Path, *, best: int
     """Write a copy of an object's USD file with the `best` valid grasps by epsilon; 0 for all.
     Mass, colliders and a physics material are added where the file has none; references stay valid.
     Raises InputError: the files are not USD, the grasps are of another object, or none is valid."""
-    if not all(path.suffix.lower() in SUFFIXES[:3] for path in (source, out)):
+    if not all(path.suffix.lower() in LAYERS for path in (source, out)):
         raise InputError(f"{source} or {out} is no USD layer; give .usd, .usda or .usdc files (unpack a .usdz)")
     if not source.is_file() or out.resolve() == source.resolve():
         raise InputError(f"{source} does not exist, or is the output file; give another output: -o OUT.usd")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -179,24 +179,28 @@ def _update_bar(bar: Progress, task: TaskID, name: str, done: float, total: floa
 def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:
     stated = f"{whole['protocol']}, {whole['level'] or 'not validated'}{', hard' if whole['hard'] else ''}"
     friction = " ".join(sorted({f"{row['mu']:g}" for row in rows}))
-    table = Table(
-        title=f"{stated}; ε at μ = {friction}, contact at 5 mm; medians",
+    table = _plain_table(
+        f"{stated}; ε at μ = {friction}, contact at 5 mm; medians",
         caption="GSR: held share; SGS: held grasps per s; PD, SPD: penetration, self-penetration [mm]; CA: contact "
         "area [cm²]; IV: intersection volume [cm³]; SD: displacement [cm]; D: variance share of the first component",
-        title_justify="left",
-        caption_justify="left",
-        box=SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-        pad_edge=False,
+        width=16,
+        headings=[heading for _, heading, _ in _COLUMNS],
     )
-    table.add_column("grasps", max_width=16, overflow="fold")
-    for _, heading, _ in _COLUMNS:
-        table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         table.add_row(Path(row["file"]).stem, *(_cell_text(row[key], digits) for key, _, digits in _COLUMNS))
     if len(rows) > 1:
         table.add_section()
         table.add_row("all", *(_cell_text(whole[key], digits) for key, _, digits in _COLUMNS))
+    return table
+
+
+def _plain_table(title: str, *, width: int, headings: Sequence[str], caption: str | None = None) -> Table:
+    """Return an empty table of files by row, with names of at most `width` characters, and numbers."""
+    looks: dict[str, Any] = {"title_justify": "left", "caption_justify": "left", "box": SIMPLE_HEAD}
+    table = Table(title=title, caption=caption, padding=(0, 1, 0, 0), pad_edge=False, **looks)
+    table.add_column("grasps", max_width=width, overflow="fold")
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
     return table
 
 
@@ -245,11 +249,7 @@ def _report_engines(verdicts: dict[str, list[EngineVerdicts]], *, json: bool) ->
         ]
         print_json(whole | {"files": files})
         return
-    title = "share of grasps that holds in each engine"
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("grasps", max_width=40, overflow="fold")
-    for heading in ("n", *names):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = _plain_table("share of grasps that holds in each engine", width=40, headings=("n", *names))
     lines = {Path(file).stem: summarise([found]) for file, found in verdicts.items()} | {"all": whole}
     for name, row in lines.items():
         if name != "all" or len(verdicts) > 1:

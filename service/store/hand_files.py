@@ -16,8 +16,9 @@ from graspd.service.store.assets import MAX_FILES, ZipFiles
 
 #: Names of a file that describes the hand besides its URDF; the first name takes precedence.
 DESCRIPTIONS: Final = ("asset.json", "hand.json")
-#: Suffixes of a hand's main file; in XML, the root element decides the format.
-SUFFIXES: Final = (".urdf", ".xacro", ".xml", ".mjcf", *usd_layers.SUFFIXES)
+#: Suffixes of a hand's main file in XML, whose root element decides the format; and of every main file.
+XML: Final = (".urdf", ".xacro", ".xml", ".mjcf")
+SUFFIXES: Final = (*XML, *usd_layers.SUFFIXES)
 #: Suffixes of the files taken from a folder besides its descriptions.
 _TAKEN: Final = (*SUFFIXES, ".yaml", ".yml", ".stl", ".obj", ".ply", ".off", ".glb", ".dae", ".msh")
 REFERENCE: Final = re.compile(r"""(?:file(?:name)?\s*=\s*["']|<uri>\s*)([^"'<]+)["'<]""")
@@ -252,7 +253,7 @@ def hand_name(leaf: str) -> str:
 
 
 def _read_description_head(files: Mapping[str, bytes], name: str) -> bytes:
-    if PurePosixPath(name).suffix.lower() not in SUFFIXES[:-4]:
+    if PurePosixPath(name).suffix.lower() not in XML:
         return b""
     if isinstance(files, ZipFiles) and files.size(name) > 1 << 23:
         with files.open(name) as stream:

@@ -7,7 +7,9 @@ from typing import Any, Final
 from graspd.service.model.errors import InputError
 from graspd.service.store.assets import MAX_FILES
 
-SUFFIXES: Final = (".usd", ".usda", ".usdc", ".usdz")
+LAYERS: Final = (".usd", ".usda", ".usdc")
+PACKAGE: Final = ".usdz"
+SUFFIXES: Final = (*LAYERS, PACKAGE)
 
 
 def import_usd(error: type[InputError] = InputError) -> None:
@@ -20,7 +22,7 @@ def import_usd(error: type[InputError] = InputError) -> None:
 
 def layer_files(path: Path) -> dict[str, Path]:
     """Return the layers of a stage by relative name, `path` first; the errors of `open_layers`."""
-    if path.suffix.lower() == SUFFIXES[3]:  # a package
+    if path.suffix.lower() == PACKAGE:
         return {path.name: path}
     import_usd()
     return {name: path.parent / name for name in open_layers(path.resolve().parent, path.name)}
@@ -57,7 +59,7 @@ def _resolve(root: Path, layer: str, reference: str) -> str:
     name = posixpath.normpath(posixpath.join(posixpath.dirname(layer), reference.replace("\\", "/")))
     if ":" in reference or not (root / name).resolve().is_relative_to(root.resolve()):
         why = "outside its folder; give the folder that holds both as a ZIP"
-    elif not name.lower().endswith(SUFFIXES[:3]):
+    elif not name.lower().endswith(LAYERS):
         why = "which is no USD layer"
     else:
         return name

@@ -80,7 +80,7 @@ class Requirements:
             kind = kinds[batch % len(kinds)]
         rule, digits = RULES.get(kind), tuple[str, ...](request.digits)
         if rule is not None and rule.digits and not digits:
-            digits = NAMES[not rule.thumb :][: rule.digits]
+            digits = NAMES[: rule.digits] if rule.thumb else NAMES[1 : 1 + rule.digits]
         texts = (request.touch_region, request.avoid_region)
         regions = [_region(text, obj, np.asarray(origin)) if text else None for text in texts]
         found = cls(kind, digits, ContactRegion(*regions) if any(texts) else WHOLE)

@@ -20,8 +20,8 @@ from graspd.service.model.errors import InputError, MeshError
 from graspd.service.model.matter import MOST_FRICTION
 from graspd.service.model.transforms import Floats
 from graspd.service.store.assets import pack, unpack
+from graspd.service.store.usd_layers import LAYERS, PACKAGE, import_usd
 from graspd.service.store.usd_layers import SUFFIXES as SUFFIXES
-from graspd.service.store.usd_layers import import_usd
 from graspd.worker.objects.formats.glb import from_linear
 from graspd.worker.objects.formats.soup import FaceNames, Soup, check_face_count
 from graspd.worker.objects.isolation import run_isolated
@@ -108,7 +108,7 @@ def read_stage(files: Mapping[str, bytes], main: str, error: type[InputError]) -
         if (data := files[main]).startswith(MAGIC[2]):
             files = unpack(data, limit_bytes=_MAX_BYTES)
             main = next((name for name in files if name.lower().endswith(SUFFIXES)), main)
-        layers = {name: files[name] for name in sorted(files) if name == main or name.lower().endswith(SUFFIXES[:3])}
+        layers = {name: files[name] for name in sorted(files) if name == main or name.lower().endswith(LAYERS)}
         if main not in layers or sum(map(len, layers.values())) > _MAX_BYTES:
             raise error(f"{main}: no layer, or layers of more than {_MAX_BYTES >> 20} MiB; decimate the meshes first")
         return _read_packed(pack(layers), main)
@@ -171,11 +171,11 @@ def axis_rotation(shape: Mapping[str, Any]) -> Floats:
 
 def stage_package(files: Mapping[str, bytes], main: str) -> tuple[str, bytes]:
     """Return name and content of a stage as one file: a layer alone, or all layers as a package."""
-    layers = sorted(name for name in files if name != main and name.lower().endswith(SUFFIXES[:3]))
-    if not main.lower().endswith(SUFFIXES[:3]) or not layers:
+    layers = sorted(name for name in files if name != main and name.lower().endswith(LAYERS))
+    if not main.lower().endswith(LAYERS) or not layers:
         return main, files[main]
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as package:
         for name in (main, *layers):
             package.writestr(zipfile.ZipInfo(name), files[name])
-    return f"{PurePosixPath(main).with_suffix('.usdz')}", buffer.getvalue()
+    return f"{PurePosixPath(main).with_suffix(PACKAGE)}", buffer.getvalue()

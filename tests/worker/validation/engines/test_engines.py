@@ -12,7 +12,6 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.validation.engines import registry
 from graspd.worker.validation.engines.registry import (
-    ENGINES,
     EngineVerdicts,
     check_engines,
     engine_columns,
@@ -26,15 +25,6 @@ from tests.worker.validation.test_lift import HAND, PLACED, grasp
 GRAVITY = 10.0  # [m/s^2], of the protocol
 FORCE = 1.0  # of each pad [N]: so small that pushes along the pads' normals move their soft drives by 1 cm
 FRICTION = 0.6
-
-
-@pytest.fixture(params=ENGINES)
-def engine(request: pytest.FixtureRequest) -> str:
-    try:
-        check_engines([request.param])
-    except InputError as missing:
-        pytest.skip(str(missing))
-    return str(request.param)
 
 
 def pinch(
