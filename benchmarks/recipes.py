@@ -32,7 +32,6 @@ CHANGES: dict[str, dict[str, Any]] = {
     "no projection": {"polish_iterations": 0},
     "initial dilation at first contact": {"dilation": "touch"},
     "13 velocities": {"velocities": 13},
-    "contact solver: averaged Jacobi": {"contact_solver": "jacobi"},
     "contact solver: Gauss-Seidel": {"contact_solver": "gauss_seidel"},
 }
 

@@ -152,7 +152,7 @@ SOLVERS: Final[dict[str, Solver]] = {
     "Jacobi, averaged": partial(reference.jacobi, passes=8),
     "Jacobi, summed": summed_jacobi,
 }
-_OFFERED: Final = tuple(SOLVERS)[:3]  # solvers that the setting `contact_solver` offers
+_OFFERED: Final = tuple(SOLVERS)[:2]  # solvers that the setting `contact_solver` offers
 
 
 def time_step_map(time_steps: Sequence[float], speeds: Sequence[float]) -> StabilityMap:

@@ -29,7 +29,6 @@ ANGLE: Final = (0.25, 0.7)  # sine of the angle between the two gradients that c
 SOLVERS: Final[dict[str, tuple[Any, Solver]]] = {
     "direct": (contact.direct, partial(reference.direct, passes=PASSES)),
     "gauss_seidel": (contact.gauss_seidel, gauss_seidel_sweep),
-    "jacobi": (contact.jacobi, partial(reference.jacobi, passes=PASSES)),
 }
 
 
@@ -67,7 +66,7 @@ def run_kernel(
             inputs = [physics, lane, dilation, hands, end, adjoint]
             wp.launch(contact.direct_gradient, dim=(1, -(-n // lane)), inputs=inputs, outputs=[given])
         else:
-            states = wp.zeros((1, m, max(n, PASSES)), dtype=contact.vec6)
+            states = wp.zeros((1, m, n), dtype=contact.vec6)
             wp.launch(SOLVERS[name][0], dim=(1, m), inputs=inputs, outputs=[states, loss, end])
         found: Any = (end, loss, given.gradient)
         return tuple(array.numpy()[0].astype(float) for array in found)

@@ -68,7 +68,7 @@ def knob_values(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValu
         found.append(KnobValue("face error bound, mm", f"{1e3 * error:g}", changed))
     found += knob("iterations", " + ", coarse_iterations=(25, 50, 100, 200), fine_iterations=(10, 20, 40, 80))
     found += knob("starts, finalists", ", ", starts=(1, 2, 4, 8), finalists=(1, 1, 2, 4))
-    found += knob("contact solver", "", contact_solver=("direct", "jacobi", "gauss_seidel"))
+    found += knob("contact solver", "", contact_solver=("direct", "gauss_seidel"))
     for passes in (1, 2, 4, 8):
         change = None if passes == LossOptions().passes else _options(passes=passes)
         found.append(KnobValue("solver passes", str(passes), change=change))

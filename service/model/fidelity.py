@@ -28,7 +28,7 @@ class Fidelity(Model):
     polish_iterations: int = Field(10, ge=0, le=100, description="Gauss-Newton steps that resolve penetration")
     patience: int = Field(10, ge=0, le=100_000, description="fine iterations without improvement before a stop; 0: off")
     velocities: Literal[7, 13] = Field(7, description="number of one-step simulations, one per object velocity (M)")
-    contact_solver: Literal["direct", "jacobi", "gauss_seidel"] = "direct"
+    contact_solver: Literal["direct", "gauss_seidel"] = "direct"
     optimizer: Literal["adam", "gd"] = "adam"
     leak: Literal["one_sided", "two_sided"] = "one_sided"
     dilation: Literal["fixed", "touch"] = Field(

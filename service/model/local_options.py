@@ -26,7 +26,7 @@ class LocalOptions(MeshOptions, JobOptions):
     """Options of `graspd synth` and `graspd.synthesize` besides hand and object."""
 
     fidelity: Annotated[str, Option("basic", _LOCAL)] = Field("standard", description=f"one of {', '.join(FIDELITIES)}")
-    contact_solver: Annotated[Literal["direct", "jacobi", "gauss_seidel"] | None, Option(places=_COMMAND)] = Field(
+    contact_solver: Annotated[Literal["direct", "gauss_seidel"] | None, Option(places=_COMMAND)] = Field(
         None, description="contact solver; default: that of the fidelity"
     )
     scene: Annotated[str | Path, Option("basic", _LOCAL)] = Field(  # type: ignore[assignment]

@@ -70,7 +70,7 @@ class Data:
             self.schedule = DeviceSchedule(zero_schedule(), self.unit)
             self._allocate(capacity, model.bodies, model.dofs, model.options.velocities)
             #: Number of motions that the contact solver stores for its reverse sweep.
-            kept = {"direct": 0, "gauss_seidel": model.count}.get(model.options.contact_solver, model.options.passes)
+            kept = model.count if model.options.contact_solver == "gauss_seidel" else 0
             self.states = wp.zeros((capacity, model.options.velocities, kept), dtype=contact.vec6)
 
     def _allocate(self, B: int, L: int, D: int, M: int) -> None:

@@ -24,7 +24,7 @@ REFERENCE_POINTS: Final = 800
 REFERENCE_SAMPLES: Final = 2000  # number of object samples at which each has weight 1
 #: Number of hand points for tests against other links at which each point has weight 1.
 REFERENCE_SELF_POINTS: Final = 1000
-SOLVERS: Final = {"direct": contact.direct, "jacobi": contact.jacobi, "gauss_seidel": contact.gauss_seidel}
+SOLVERS: Final = {"direct": contact.direct, "gauss_seidel": contact.gauss_seidel}
 NEAR_GAP: Final = 4e-3  # largest gap of contacts in the direct solver's near list: four steps of the object [m]
 CPU_LANE: Final = 64  # points per thread on the CPU, where starting a thread costs as much as a point; on CUDA 1
 MAX_DILATION: Final = 0.1  # largest dilation of a schedule [m]

@@ -85,9 +85,8 @@ def test_the_optimiser_lowers_the_loss_it_started_from() -> None:
     assert curve[-1] < 0.5 * curve[0]
 
 
-@pytest.mark.parametrize("solver", ["jacobi", "gauss_seidel"])
-def test_the_other_contact_solvers_also_reach_the_object(solver: str) -> None:
-    found = grasps(6, DRAFT.model_copy(update={"contact_solver": solver}))
+def test_the_other_contact_solver_also_reaches_the_object() -> None:
+    found = grasps(6, DRAFT.model_copy(update={"contact_solver": "gauss_seidel"}))
     quality = measure(hand_from_path("allegro"), object_from_path("mug"), found, friction=1.0)
     assert np.median(quality["quality/contact_links"]) >= 2
 

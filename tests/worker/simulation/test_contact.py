@@ -146,9 +146,7 @@ def test_one_contact_gives_object_the_momentum_of_its_impulse() -> None:
 def test_a_balanced_grasp_leaves_the_object_at_rest_without_nan() -> None:
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     balanced = Contacts(0.04 * axes, axes, np.full(6, -5e-4), np.ones(6))
-    for name in ("direct", "jacobi"):
-        end, _, _ = run(name, balanced, WORLD)
-        np.testing.assert_allclose(end[0], 0, atol=1e-8)
+    np.testing.assert_allclose(run("direct", balanced, WORLD)[0][0], 0, atol=1e-8)
     touching = Contacts(np.zeros((3, 3)), np.eye(3), np.zeros(3), np.ones(3))
     for name in SOLVERS:
         for part in run(name, touching, WORLD, leak=0.1):
@@ -275,8 +273,8 @@ def test_the_projection_holds_no_point_that_must_not_touch() -> None:
 
 
 def test_solvers_without_limits_on_contacts_refuse_them() -> None:
-    with pytest.raises(InputError, match="jacobi allows contact anywhere: use direct"):
-        rig(HAND, BOX, capacity=1, options=LossOptions(contact_solver="jacobi"), allowed=LEFT)
+    with pytest.raises(InputError, match="gauss_seidel allows contact anywhere: use direct"):
+        rig(HAND, BOX, capacity=1, options=LossOptions(contact_solver="gauss_seidel"), allowed=LEFT)
 
 
 AT_ORIGIN = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))

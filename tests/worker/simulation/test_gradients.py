@@ -236,7 +236,7 @@ def test_unknown_solvers_and_optimizers_are_refused_in_a_line() -> None:
 
 
 @pytest.mark.parametrize("slivers", [False, True])
-@pytest.mark.parametrize("solver", ["direct", "jacobi", "gauss_seidel"])
+@pytest.mark.parametrize("solver", ["direct", "gauss_seidel"])
 def test_loss_and_gradient_are_finite_wherever_the_hand_is(solver: str, slivers: bool) -> None:
     """At the ball's centre, on the ball, far away; also with corner normals of length 0, as a sliver face has them."""
     hand, obj = hand_from_path("allegro"), ball()

@@ -37,7 +37,6 @@ def loss_options(fidelity: Fidelity) -> LossOptions:
         contact_solver=fidelity.contact_solver,
         velocities=fidelity.velocities,
         friction=0.8,
-        passes=4 if fidelity.contact_solver == "direct" else 8,
         one_sided=fidelity.leak == "one_sided",
         leak_length=0.02 if fidelity.leak == "one_sided" else 1e3,
         limit_weight=100.0 if paper else 0.0,
