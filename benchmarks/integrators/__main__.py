@@ -1,4 +1,4 @@
-"""Map where integrators, gradients and the planner's descent fail, for an Allegro hand and a block.
+"""Map failures of integrators, gradients, descents, planning in scenes, and of grasps in wrong models.
 
 usage: python -m benchmarks.integrators --out DIR [--only MAP ...] [--quick]
 DIR receives stability.json, stability.md and the maps; `graspd stability --from` merges and publishes them. The quick
@@ -10,27 +10,37 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from benchmarks.integrators import descents, flights, gradients
+from benchmarks.integrators import descents, flights, gradients, model_errors, scenes
 from graspd.service.model.clock import timestamp
 from graspd.service.model.studies import Stability, StabilityMap
 from graspd.service.model.version import PACKAGE_VERSION
+from graspd.studies.stability.assets import MapOptions
 from graspd.studies.stability.report import write
 from graspd.worker.engines import backend
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 
-MAPS = ("time_step", "stiffness", "contact_count", "gradient", "starts", "rates", "length")
+SCENES = ("scene_height", "scene_wall", "scene_neighbours", "scene_size")
+MAPS = ("time_step", "stiffness", "contact_count", "gradient", "starts", "rates", "length", "model_errors", *SCENES)
 
 
 def measure(names: Sequence[str], *, quick: bool, say: Callable[[str], object]) -> list[StabilityMap]:
     """Return the named maps; `say` receives a line per map and per cell of a descent."""
     hand, thing = hand_from_path("allegro"), object_from_path("block")
+    others = () if quick else ("barrett", "shadow")  # their drives and sizes differ
     count = 4 if quick else 8
 
-    def few(values: Sequence[float]) -> Sequence[float]:
+    def few(values: Sequence[Any]) -> Sequence[Any]:
         return values[1::2] if quick else values
+
+    def scene(name: str, *axes: tuple[Any, ...]) -> StabilityMap:
+        options = MapOptions(2 if quick else 8, "draft", say=say)
+        hands = [hand, *map(hand_from_path, others[:1])]
+        return scenes.scene_map(name, hands, options, xs=few(axes[0]), ys=few(axes[1]))
 
     lengths = descents.LENGTHS[:1] if quick else descents.LENGTHS
     maps: dict[str, Callable[[], StabilityMap]] = {
@@ -47,6 +57,16 @@ def measure(names: Sequence[str], *, quick: bool, say: Callable[[str], object]) 
             hand, thing, rates=few(descents.RATES), weights=few(descents.WEIGHTS), count=count, say=say
         ),
         "length": lambda: descents.length_map(hand, thing, lengths=lengths, say=say),
+        "model_errors": lambda: model_errors.model_error_map(
+            [hand, *map(hand_from_path, others)],
+            thing,
+            MapOptions(2 if quick else 16, "draft" if quick else "standard", say=say),
+            every=3 if quick else 1,
+        ),
+        "scene_height": partial(scene, "scene_height", scenes.HEIGHTS_MM, scenes.SIDES_MM),
+        "scene_wall": partial(scene, "scene_wall", scenes.GAPS_MM, tuple(scenes.WALLS)),
+        "scene_neighbours": partial(scene, "scene_neighbours", scenes.GAPS_MM, tuple(scenes.NEIGHBOURS)),
+        "scene_size": partial(scene, "scene_size", scenes.RATIOS, scenes.KINDS),
     }
     found = []
     for name in names:

@@ -38,6 +38,10 @@ _MERGED = (
     "graspd stability --from WORK/integrators/stability.json --from WORK/shapes/stability.json "
     "--out OUT/results/stability"
 )
+_MERGED_HANDS = (
+    "graspd stability --from WORK/hands/stability.json --from WORK/model-errors/stability.json "
+    "--out OUT/results/hands-stability"
+)
 
 
 _TRAIN = (
@@ -165,10 +169,15 @@ STUDIES: Final = (
         "hands-stability",
         "failures with difficult hands, model errors and baselines",
         ("results/hands-stability/*",),
-        ("graspd stability --only hands --only model_errors --only baselines --out OUT/results/hands-stability",),
         (
-            "graspd stability --quick --only hands --only model_errors --only baselines "
-            "--out OUT/results/hands-stability",
+            "graspd stability --only hands --only baselines --out WORK/hands",
+            "python -m benchmarks.integrators --only model_errors --out WORK/model-errors",
+            _MERGED_HANDS,
+        ),
+        (
+            "graspd stability --quick --only hands --only baselines --out WORK/hands",
+            "python -m benchmarks.integrators --quick --only model_errors --out WORK/model-errors",
+            _MERGED_HANDS,
         ),
     ),
     Study(
@@ -176,10 +185,10 @@ STUDIES: Final = (
         "failures of planning in scenes",
         ("results/scenes-stability/*",),
         (
-            "graspd stability --only scene_height --only scene_wall --only scene_neighbours --only scene_size "
+            "python -m benchmarks.integrators --only scene_height scene_wall scene_neighbours scene_size "
             "--out OUT/results/scenes-stability",
         ),
-        ("graspd stability --quick --only scene_height --hand barrett --out OUT/results/scenes-stability",),
+        ("python -m benchmarks.integrators --quick --only scene_height --out OUT/results/scenes-stability",),
         IN_SCENES,
     ),
     Study(

@@ -84,17 +84,13 @@ def _check_fidelities(fidelities: Sequence[str]) -> list[str]:
     return list(fidelities)
 
 
-STUDIES: Final = (
-    *("shapes", "hands", "model_errors", "baselines"),
-    *("scene_height", "scene_wall", "scene_neighbours", "scene_size"),
-)
+STUDIES: Final = ("shapes", "hands", "baselines")
 
 
 @app.command(epilog="graspd stability --only shapes --only hands --out stability --publish")
 def stability(
     only: Annotated[list[str] | None, typer.Option(help=f"Study: {', '.join(STUDIES)}; repeatable.")] = None,
     hand: Annotated[str, typer.Option(help="URDF or built-in hand.")] = "allegro",
-    object_: Annotated[str, typer.Option("--object", help="Mesh or built-in object.")] = "block",
     quick: Annotated[bool, typer.Option("--quick", help="Few cells per map: under a minute of CPU time.")] = False,
     threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for stability.json, stability.md and the maps.")] = None,
@@ -105,7 +101,7 @@ def stability(
     data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Map where planners fail: shapes, hands, model errors and scenes."""
+    """Map where planners fail: shapes of objects and structures of hands."""
     from graspd.studies.stability.report import markdown, write
 
     if unknown := [name for name in only or [] if name not in STUDIES]:
@@ -114,7 +110,7 @@ def stability(
         found = _merge([_read_record(path, "stability", parse_stability) for path in source])
         found = replace(found, maps=[one for one in found.maps if not only or one.name in only])
     else:
-        found = _measure_maps(tuple(only or STUDIES), hand, object_, quick=quick, threads=threads)
+        found = _measure_maps(tuple(only or STUDIES), hand, quick=quick, threads=threads)
     if out is not None:
         write(found, out)
     key = _publish(STABILITY, found.as_json(), data_dir) if publish else None
@@ -124,7 +120,7 @@ def stability(
     print_result(told, markdown(found), json=json)
 
 
-def _measure_maps(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, threads: int) -> Stability:
+def _measure_maps(names: tuple[str, ...], hand: str, *, quick: bool, threads: int) -> Stability:
     from graspd.worker.engines import backend
 
     backend.start_warp()
@@ -132,7 +128,7 @@ def _measure_maps(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, t
 
     from graspd.studies.stability.studies import run_studies
 
-    maps = run_studies(names, hand, obj, quick=quick, work=ExecutionContext(threads=threads), say=_echo)
+    maps = run_studies(names, hand, quick=quick, work=ExecutionContext(threads=threads), say=_echo)
     command = shlex.join(["graspd", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])
     return Stability(timestamp(), command, {"graspd": PACKAGE_VERSION, "warp": wp.__version__}, maps)
 

@@ -1,41 +1,23 @@
 """Stability studies by name, full or quick; and the baselines on difficult shapes."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from itertools import product
-from typing import Any, Final
+from typing import Final
 
 from graspd.service.model.studies import StabilityMap, mark_reachable
-from graspd.studies.stability import assets, model_errors, scenes
+from graspd.studies.stability import assets
 from graspd.studies.stability.assets import BOUNDS, FAMILIES, MEASURE, SHOWS, MapOptions, shape_cell
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.prepare import object_from_path
-
-OTHER_HANDS: Final = ("barrett",)  # further hands, for effects of size and structure
-Values = Sequence[Any]  # values on an axis of a map
-ALL_HANDS: Final = ("allegro", "barrett", "shadow")  # hands for effects of different drives
 
 
 def run_studies(
-    names: Sequence[str], hand: str, obj: str, *, quick: bool, work: ExecutionContext, say: Callable[[str], None]
+    names: Sequence[str], hand: str, *, quick: bool, work: ExecutionContext, say: Callable[[str], None]
 ) -> list[StabilityMap]:
     """Return the maps of the named studies; `say` receives a line per cell."""
-    model, thing = hand_from_path(hand), object_from_path(obj)
-
-    def hands_to_compare(names: Sequence[str]) -> list[HandModel]:
-        return [model] if quick else [model, *(hand_from_path(name) for name in names if name != model.name)]
-
+    model = hand_from_path(hand)
     options = MapOptions(4 if quick else 8, "draft" if quick else "standard", work, say)
-    few_errors = replace(options, count=2 if quick else 16)
-    in_scenes = replace(options, count=2 if quick else 8, fidelity="draft")
-
-    def scene(name: str, xs: Values, ys: Values, few: tuple[Values, Values]) -> Callable[[], StabilityMap]:
-        return lambda: scenes.scene_map(
-            name, hands_to_compare(OTHER_HANDS), in_scenes, xs=few[0] if quick else xs, ys=few[1] if quick else ys
-        )
-
     studies: dict[str, Callable[[], StabilityMap]] = {
         "shapes": lambda: assets.shape_map(
             model,
@@ -52,16 +34,9 @@ def run_studies(
             ratios=() if quick else assets.RATIOS,
             couplings=("each joint",) if quick else assets.COUPLINGS,
         ),
-        "model_errors": lambda: model_errors.model_error_map(
-            hands_to_compare(ALL_HANDS), thing, few_errors, every=3 if quick else 1
-        ),
         "baselines": lambda: baseline_map(
             model, options, methods=METHODS[:2] if quick else METHODS, shapes={"cube": (60,)} if quick else SHAPES
         ),
-        "scene_height": scene("scene_height", scenes.HEIGHTS_MM, scenes.SIDES_MM, ((10, 80), (60,))),
-        "scene_wall": scene("scene_wall", scenes.GAPS_MM, tuple(scenes.WALLS), ((5, 80), ("corner",))),
-        "scene_neighbours": scene("scene_neighbours", scenes.GAPS_MM, tuple(scenes.NEIGHBOURS), ((5, 80), ("four",))),
-        "scene_size": scene("scene_size", scenes.RATIOS, scenes.KINDS, ((0.1, 0.3), ("table",))),
     }
     found = []
     for name in names:
