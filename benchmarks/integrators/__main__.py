@@ -1,4 +1,4 @@
-"""Map failures of integrators, gradients, descents, planning in scenes, and of grasps in wrong models.
+"""Map failures of integrators, gradients, descents, difficult hands, wrong models and difficult scenes.
 
 usage: python -m benchmarks.integrators --out DIR [--only MAP ...] [--quick]
 DIR receives stability.json, stability.md and the maps; `graspd stability --from` merges and publishes them. The quick
@@ -14,18 +14,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.integrators import descents, flights, gradients, model_errors, scenes
+from benchmarks.integrators import descents, flights, gradients, hands, model_errors, scenes
 from graspd.service.model.clock import timestamp
 from graspd.service.model.studies import Stability, StabilityMap
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.studies.stability.assets import MapOptions
 from graspd.studies.stability.report import write
+from graspd.studies.stability.shapes import MapOptions
 from graspd.worker.engines import backend
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 
 SCENES = ("scene_height", "scene_wall", "scene_neighbours", "scene_size")
-MAPS = ("time_step", "stiffness", "contact_count", "gradient", "starts", "rates", "length", "model_errors", *SCENES)
+PHYSICS = ("time_step", "stiffness", "contact_count", "gradient", "starts", "rates", "length")
+MAPS = (*PHYSICS, "hands", "model_errors", *SCENES)
 
 
 def measure(names: Sequence[str], *, quick: bool, say: Callable[[str], object]) -> list[StabilityMap]:
@@ -39,8 +40,8 @@ def measure(names: Sequence[str], *, quick: bool, say: Callable[[str], object]) 
 
     def scene(name: str, *axes: tuple[Any, ...]) -> StabilityMap:
         options = MapOptions(2 if quick else 8, "draft", say=say)
-        hands = [hand, *map(hand_from_path, others[:1])]
-        return scenes.scene_map(name, hands, options, xs=few(axes[0]), ys=few(axes[1]))
+        compared = [hand, *map(hand_from_path, others[:1])]
+        return scenes.scene_map(name, compared, options, xs=few(axes[0]), ys=few(axes[1]))
 
     lengths = descents.LENGTHS[:1] if quick else descents.LENGTHS
     maps: dict[str, Callable[[], StabilityMap]] = {
@@ -57,6 +58,13 @@ def measure(names: Sequence[str], *, quick: bool, say: Callable[[str], object]) 
             hand, thing, rates=few(descents.RATES), weights=few(descents.WEIGHTS), count=count, say=say
         ),
         "length": lambda: descents.length_map(hand, thing, lengths=lengths, say=say),
+        "hands": lambda: hands.hand_map(
+            MapOptions(count, "draft" if quick else "standard", say=say),
+            fingers=(1, 3) if quick else hands.FINGERS,
+            sizes=() if quick else hands.SIZES,
+            ratios=() if quick else hands.RATIOS,
+            couplings=("each joint",) if quick else hands.COUPLINGS,
+        ),
         "model_errors": lambda: model_errors.model_error_map(
             [hand, *map(hand_from_path, others)],
             thing,
@@ -78,7 +86,7 @@ def measure(names: Sequence[str], *, quick: bool, say: Callable[[str], object]) 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder for the maps")
-    parser.add_argument("--only", nargs="+", choices=MAPS, default=MAPS)
+    parser.add_argument("--only", nargs="+", choices=MAPS, default=PHYSICS)
     parser.add_argument("--quick", action="store_true", help="few cells per map")
     args = parser.parse_args(arguments)
     backend.start_warp()
@@ -86,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     maps = measure(args.only, quick=args.quick, say=lambda line: sys.stderr.write(f"{line}\n"))
     words = ["python -m benchmarks.integrators", *(["--quick"] if args.quick else [])]
-    if args.only != MAPS:
+    if args.only != PHYSICS:
         words += ["--only", *args.only]
     versions = {"graspd": PACKAGE_VERSION, "warp": wp.__version__}
     write(Stability(timestamp(), " ".join(words), versions, maps), args.out)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.studies import MapCell, Outcome, StabilityMap
-from graspd.studies.stability.assets import MapOptions
+from graspd.studies.stability.shapes import MapOptions
 from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel

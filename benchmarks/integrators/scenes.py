@@ -16,7 +16,7 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec
 from graspd.service.model.studies import MapCell, Outcome, StabilityMap, mark_reachable
 from graspd.service.model.transforms import quat_rotate
-from graspd.studies.stability.assets import MILLIMETRES, MapOptions, outcome_of, prepare_mesh, refused_cell
+from graspd.studies.stability.shapes import MILLIMETRES, MapOptions, outcome_of, prepare_mesh, refused_cell
 from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel

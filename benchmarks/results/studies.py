@@ -39,7 +39,7 @@ _MERGED = (
     "--out OUT/results/stability"
 )
 _MERGED_HANDS = (
-    "graspd stability --from WORK/hands/stability.json --from WORK/model-errors/stability.json "
+    "graspd stability --from WORK/hands/stability.json --from WORK/baselines/stability.json "
     "--out OUT/results/hands-stability"
 )
 
@@ -170,13 +170,13 @@ STUDIES: Final = (
         "failures with difficult hands, model errors and baselines",
         ("results/hands-stability/*",),
         (
-            "graspd stability --only hands --only baselines --out WORK/hands",
-            "python -m benchmarks.integrators --only model_errors --out WORK/model-errors",
+            "graspd stability --only baselines --out WORK/baselines",
+            "python -m benchmarks.integrators --only hands model_errors --out WORK/hands",
             _MERGED_HANDS,
         ),
         (
-            "graspd stability --quick --only hands --only baselines --out WORK/hands",
-            "python -m benchmarks.integrators --quick --only model_errors --out WORK/model-errors",
+            "graspd stability --quick --only baselines --out WORK/baselines",
+            "python -m benchmarks.integrators --quick --only hands model_errors --out WORK/hands",
             _MERGED_HANDS,
         ),
     ),

@@ -84,10 +84,10 @@ def _check_fidelities(fidelities: Sequence[str]) -> list[str]:
     return list(fidelities)
 
 
-STUDIES: Final = ("shapes", "hands", "baselines")
+STUDIES: Final = ("shapes", "baselines")
 
 
-@app.command(epilog="graspd stability --only shapes --only hands --out stability --publish")
+@app.command(epilog="graspd stability --only shapes --out stability --publish")
 def stability(
     only: Annotated[list[str] | None, typer.Option(help=f"Study: {', '.join(STUDIES)}; repeatable.")] = None,
     hand: Annotated[str, typer.Option(help="URDF or built-in hand.")] = "allegro",
@@ -101,7 +101,7 @@ def stability(
     data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Map where planners fail: shapes of objects and structures of hands."""
+    """Map where planners fail: difficult shapes, for fast_graspd and for the baselines."""
     from graspd.studies.stability.report import markdown, write
 
     if unknown := [name for name in only or [] if name not in STUDIES]:
@@ -126,7 +126,7 @@ def _measure_maps(names: tuple[str, ...], hand: str, *, quick: bool, threads: in
     backend.start_warp()
     import warp as wp
 
-    from graspd.studies.stability.studies import run_studies
+    from graspd.studies.stability.shapes import run_studies
 
     maps = run_studies(names, hand, quick=quick, work=ExecutionContext(threads=threads), say=_echo)
     command = shlex.join(["graspd", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])

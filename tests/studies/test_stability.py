@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.integrators import descents, flights, gradients, scenes
+from benchmarks.integrators import descents, flights, gradients, hands, scenes
 from benchmarks.integrators.__main__ import MAPS, measure
+from benchmarks.integrators.hands import Coupling, ring_hand
 from benchmarks.integrators.model_errors import ERRORS, model_error_map
 from graspd.commands.studies import STUDIES
 from graspd.commands.synth import _format_summary
@@ -23,9 +24,9 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.studies import MapCell, Stability, StabilityMap, grade, parse_stability
 from graspd.service.store.records import latest_record
 from graspd.service.store.store import open_store
-from graspd.studies.stability import assets, studies
-from graspd.studies.stability.assets import Coupling, MapOptions, ring_hand
+from graspd.studies.stability import shapes
 from graspd.studies.stability.report import markdown, write
+from graspd.studies.stability.shapes import MapOptions
 from graspd.worker.engines import backend
 from graspd.worker.execution_context import DEFAULT_CONTEXT
 from graspd.worker.generation import ValidatedBatch, validated_grasps
@@ -100,7 +101,7 @@ def test_gradients_agree_at_the_sizes_of_hands_and_their_objects() -> None:
 
 def test_a_shape_is_refused_or_its_grasps_are_sound(hand: HandModel) -> None:
     defects = ("a side is missing", "inside out")
-    opened, inverted = assets.shape_map(hand, FEW, fidelities=("draft",), families=(), defects=defects).cells
+    opened, inverted = shapes.shape_map(hand, FEW, fidelities=("draft",), families=(), defects=defects).cells
     assert opened.outcome == "refused" and "allow-open" in opened.note
     assert inverted.outcome in ("good", "weak"), inverted.note
 
@@ -113,7 +114,7 @@ def test_a_start_that_is_too_far_is_flagged(pair: Pair) -> None:
 
 
 def test_a_job_whose_every_grasp_is_bad_ends_with_none(hand: HandModel) -> None:
-    crumb = assets.prepare_mesh(assets.cube(1), 1e-5)
+    crumb = shapes.prepare_mesh(shapes.cube(1), 1e-5)
     request = JobRequest(hand="hand", object="crumb", grasps=2, fidelity="draft", budget=2, rechecks=0)
     found = validated_grasps(hand, crumb, request, count=2)
     assert found.candidates == len(found.grasps) + sum(found.rejected.values())
@@ -130,7 +131,7 @@ def test_a_long_run_does_not_drift(pair: Pair) -> None:
 def test_a_quick_run_takes_less_than_the_minute_that_it_promises() -> None:
     started = time.process_time()
     options = {"quick": True, "work": DEFAULT_CONTEXT, "say": lambda line: None}
-    found = studies.run_studies(STUDIES, "allegro", **options)
+    found = shapes.run_studies(STUDIES, "allegro", **options)
     assert time.process_time() - started < 60  # CPU seconds: others may keep the machine busy
     assert [one.name for one in found] == list(STUDIES) and all(one.cells for one in found)
 
@@ -200,9 +201,9 @@ def test_fingers_open_outward_scale_and_follow_by_ratio() -> None:
 
 def test_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
     backend.start_warp()
-    none, three = assets.hand_map(FEW, fingers=(0, 3), couplings=("distal follows",)).cells
+    none, three = hands.hand_map(FEW, fingers=(0, 3), couplings=("distal follows",)).cells
     assert none.outcome == "refused" and three.value > 0
-    driven = assets.hand_map(FEW, fingers=(3, 5), couplings=("one drive",)).cells
+    driven = hands.hand_map(FEW, fingers=(3, 5), couplings=("one drive",)).cells
     assert [cell.outcome for cell in driven] == ["good", "good"]
 
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.integrators.hands import ring_hand
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import HandError, InputError
 from graspd.service.model.transforms import IDENTITY_POSE, apply, quat_rotate
-from graspd.studies.stability.assets import ring_hand
 from graspd.worker.generation import validated_grasps
 from graspd.worker.hands import pinch_postures as oppositions
 from graspd.worker.hands.digits import (

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.integrators.hands import ring_hand
 from graspd.commands.synth import _format_summary
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import apply, quat_from_matrix, quat_rotate
-from graspd.studies.stability.assets import ring_hand
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.synthesis import synthesize_grasps
 from graspd.worker.grasps import Posture
