@@ -22,17 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cells import cell_parser, planned
+from benchmarks.hand_matching import HandMatch, match_hands
+from benchmarks.second_hand import transfer_drives, transfer_grasps
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.transforms import Floats, apply, compose, invert
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.collisions import collision_exempt_pairs
-from graspd.worker.hands.hand_matching import HandMatch, match_hands
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.intervals import wilson_interval
-from graspd.worker.validation.foreign import transfer_drives, transfer_grasps
 from graspd.worker.validation.validator import validate
 
 HAND = "hands/shadow/shadow_hand_right.urdf"

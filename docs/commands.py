@@ -60,7 +60,7 @@ NOT_RUN: Final = (
     (r"\.\.\.|…|\[-|\[[A-Z]|<\w", "is a template of several commands"),
     (
         r"\b(DATA|DIR|FILE|FOLDER|HAND|OBJECT|OTHER|BEFORE|AFTER|NAME|ID|UUID|URL|MESH|SHARDS|SOURCES|W|JOB|PROJECT|KEY|"
-        r"PASSWORD)\b|--joint-map",
+        r"PASSWORD)\b|second_hand",
         "has a placeholder",
     ),
     (r"python src/|dexlearn\.train|cp -r", "needs the sources of another project"),

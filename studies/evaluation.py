@@ -16,7 +16,6 @@ from graspd.service.model.errors import InputError, MeshError, choices_text
 from graspd.service.model.metrics import perturbed_parameter_name
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet
-from graspd.worker.hands.hand_matching import HandMatch
 from graspd.worker.quality.contact import contact_distance_consistency_mm
 from graspd.worker.quality.diversity import explained_variance, hand_points, least_distance
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
@@ -25,7 +24,6 @@ from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.displacement import simulated_displacement_cm
-from graspd.worker.validation.foreign import foreign_verdicts, share_counts
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.lifting import LiftLevel, LiftVerdicts, validate_lifts
@@ -57,7 +55,6 @@ def evaluate(
     hard: bool = False,
     friction: float | None = None,
     models: int = 0,
-    validation_hand: HandMatch | None = None,
     tell: Callable[[Robustness], None] = lambda found: None,
     cache: Path | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
@@ -74,7 +71,6 @@ def evaluate(
     - with `models` models around the nominal one: robust_share (mean over held grasps), robust_n (their number),
       robust_axes (share by axis); `tell` receives the results
     - protocol lift: clear_share, without collision in approach, closing and lift
-    - with another model of the hand, `validation_hand`: `ForeignVerdicts.facts`, held_foreign and reason_foreign
 
     Raises InputError: protocol lift on grasps of a free object, or a level that the protocol lacks."""
     level = checked_level(protocol, level)
@@ -99,11 +95,6 @@ def evaluate(
         row |= _success(case, verdicts)
         if models:
             row |= _model_results(case, case.grasps, row, models, tell, held=verdicts.success, **common)
-        if validation_hand is not None:
-            both = foreign_verdicts(validation_hand, case.obj, case.grasps, verdicts, pieces=pieces, run=run)
-            row |= both.facts()
-            for one, held, reason in zip(row["verdicts"], both.foreign.success, both.foreign.reasons, strict=True):
-                one |= {"held_foreign": bool(held), "reason_foreign": reason}
     elif protocol == "lift" and case.placed is not None:
         common |= {"placed": case.placed, "level": level}
         grasps, clear = with_trajectories(case, case.placed)
@@ -259,9 +250,6 @@ def combine_rows(rows: list[dict[str, Any]]) -> dict[str, Any]:
     out["agreement_published"] = _rate(validated, "agreement_published", "published")
     if any("robust_share" in row for row in rows):
         out |= _combine_models([row for row in rows if "robust_share" in row])
-    if counted := [row["foreign_held"] for row in rows if "foreign_held" in row]:
-        out |= share_counts({key: sum(one[key] for one in counted) for key in counted[0]})
-        out["fingertips_mm"] = max(row["fingertips_mm"] for row in rows if "foreign_held" in row)
     for key in ("sgs", "sgs_without_validation"):
         # Held grasps of all rows over the seconds of all rows.
         timed = [row for row in validated if row[key]]

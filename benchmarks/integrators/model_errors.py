@@ -114,7 +114,7 @@ def model_error_map(
         cells,
         "a valid grasp fails on a robot that differs from the model",
         "`--robust` selects grasps that hold in the wanted share of models with such errors; `robust_share` and "
-        "`robust_weakest` are stored. For larger errors, test another hand model: `graspd evaluate --validation-hand`",
+        "`robust_weakest` are stored. For larger errors, test another hand model: `python -m benchmarks.second_hand`",
         "tests/studies/test_stability.py::test_amounts_within_reach_are_those_that_robust_draws",
         reach="errors within the range of `--robust`",
     )

@@ -21,8 +21,6 @@ from graspd.studies.engines import compare_engines, summarise
 from graspd.studies.evaluation import checked_level, combine_rows, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.subsets import require_empty_folder
-from graspd.worker.hands.hand_matching import TOLERANCE_M, match_hands
-from graspd.worker.hands.load import hand_from_path
 from graspd.worker.validation.engines.registry import EngineVerdicts, check_engines, engine_columns
 from graspd.worker.validation.robust import Robustness
 
@@ -51,11 +49,6 @@ def evaluate_command(
     friction: Annotated[
         float | None, typer.Option(min=0.01, max=3.0, help="Friction coefficient for ε; default: that of the file.")
     ] = None,
-    validation_hand: Annotated[str | None, typer.Option(help="Second model of the hand, to validate with.")] = None,
-    joint_map: Annotated[str | None, typer.Option(help="OURS=THEIRS,...: joints with different names.")] = None,
-    validation_tolerance: Annotated[
-        float, typer.Option(min=0.0, help="Maximum distance between fingertips of the two models [mm].")
-    ] = 1e3 * TOLERANCE_M,
     engines: Annotated[
         str, typer.Option("--engines", "--engine", help="Engines to compare: mujoco, physx, drake; commas between.")
     ] = "",
@@ -69,15 +62,9 @@ def evaluate_command(
     level = checked_level(protocol, level)
     if robust and protocol == "displacement":
         raise InputError("--robust repeats pushes or lifts in perturbed models: use --protocol dexgraspbench or lift")
-    if validation_hand is None and joint_map:
-        raise InputError("--joint-map needs --validation-hand")
-    if validation_hand is not None and protocol != "dexgraspbench":
-        raise InputError(f"--validation-hand validates by protocol dexgraspbench, not by {protocol}")
-    other = None if validation_hand is None else hand_from_path(validation_hand, drag=True)
-    twins = _joint_map(joint_map)
     several = check_engines([one.strip() for one in engines.split(",")]) if engines else ()
-    if several and (robust or validation_hand or protocol == "displacement"):
-        raise InputError("--engines compares verdicts on pushes or lifts alone, without --robust or --validation-hand")
+    if several and (robust or protocol == "displacement"):
+        raise InputError("--engines compares verdicts on pushes or lifts alone, without --robust")
     listed = [one for path in files for one in expand_path(path)]
     copies = _copy_paths(files, listed, out, columns=bool(robust or several), hard=hard)
     rows: list[dict[str, Any]] = []
@@ -100,8 +87,6 @@ def evaluate_command(
                 if copies:
                     write_copy(file, copies[file], engine_columns(found), {"engines": ",".join(several)})
                 continue
-            tolerance_m = validation_tolerance / 1e3
-            twin = None if other is None else match_hands(case.hand, other, twins, tolerance_m=tolerance_m)
             row = evaluate(
                 case,
                 protocol=protocol,  # type: ignore[arg-type]
@@ -109,7 +94,6 @@ def evaluate_command(
                 hard=hard,
                 friction=friction,
                 models=robust,
-                validation_hand=twin,
                 tell=partial(_write_robust, file, copies[file]) if copies else lambda found: None,
                 run=run,
             )
@@ -117,10 +101,10 @@ def evaluate_command(
     if several:
         _report_engines(verdicts, json=json)
         return
-    _report(rows, other.name if other else "", json=json)
+    _report(rows, json=json)
 
 
-def _report(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
+def _report(rows: list[dict[str, Any]], *, json: bool) -> None:
     whole = combine_rows([{key: value for key, value in row.items() if key != "file"} for row in rows])
     if json:
         verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
@@ -130,8 +114,6 @@ def _report(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
         plain_console().print(_table(rows, whole))
         if whole.get("robust_share") is not None:
             typer.echo(_format_robustness(whole))
-        if "foreign_held" in whole:
-            typer.echo(_format_second_model(whole, foreign))
         for row in rows:
             if "note" in row:
                 typer.echo(row["note"], err=True)
@@ -160,16 +142,6 @@ def _format_robustness(whole: dict[str, Any]) -> str:
     each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
     models = f"{whole['robust_share']:.2f} of {whole['robust_models']} perturbed models"
     return f"robust: {whole['robust_n']} held grasps hold in {models}\nby perturbed parameter: {each}"
-
-
-def _joint_map(text: str | None) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for pair in (text or "").split(",") if text else []:
-        ours, equals, theirs = (part.strip() for part in pair.partition("="))
-        if not (ours and equals and theirs) or ours in found:
-            raise InputError(f"--joint-map {pair!r} must be OURS=THEIRS, once for each joint")
-        found[ours] = theirs
-    return found
 
 
 def _update_bar(bar: Progress, task: TaskID, name: str, done: float, total: float, what: str) -> None:
@@ -202,16 +174,6 @@ def _plain_table(title: str, *, width: int, headings: Sequence[str], caption: st
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
     return table
-
-
-def _format_second_model(whole: dict[str, Any], name: str) -> str:
-    held = whole["foreign_held"]
-    share = _cell_text(whole["foreign_share"], 2)
-    return (
-        f"{name}, fingertips within {whole['fingertips_mm']:.2f} mm: GSR {_cell_text(whole['foreign_gsr'], 2)}; "
-        f"{held['both']} of {held['both'] + held['nominal']} grasps held by the first model also hold here ({share}); "
-        f"agreement {_cell_text(whole['agreement'], 2)}"
-    )
 
 
 def _cell_text(value: float | None, digits: int) -> str:

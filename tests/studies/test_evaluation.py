@@ -161,18 +161,13 @@ def test_engines_are_compared_and_a_copy_has_their_columns(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ("--joint-map FFJ3=bend", "needs --validation-hand"),
-        ("--validation-hand shadow --joint-map FFJ3", "must be OURS=THEIRS"),
-        ("--validation-hand shadow --joint-map FFJ3=a,FFJ3=b", "once for each joint"),
-        ("--validation-hand shadow --joint-map FFJ3=bend,FFJ4=knuckle", "grasps.h5"),
-        ("--validation-hand shadow --protocol lift", "validates by protocol dexgraspbench"),
         ("--level quick", "unknown"),
         ("--protocol throw", "unknown"),
         ("--engines mujoco,havok", "unknown engine 'havok'"),
         ("--engine mujoco --robust 8", "without --robust"),
     ],
 )
-def test_another_model_is_asked_for_in_full(options: str, says: str) -> None:
+def test_options_that_exclude_each_other_are_refused(options: str, says: str) -> None:
     assert says in refused(f"evaluate grasps.h5 {options}")
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yourdfpy
 
+from benchmarks.hand_matching import match_hands
 from graspd.exchange.bench_hand import write_hand
 from graspd.service.model.errors import HandError, InputError
 from graspd.service.model.states import AssetKind
@@ -17,7 +18,6 @@ from graspd.service.model.transforms import IDENTITY_POSE, apply, compose, inver
 from graspd.service.store.assets import builtin_asset, builtin_names
 from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.collisions import touching_bodies
-from graspd.worker.hands.hand_matching import match_hands
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel

@@ -10,21 +10,20 @@ import pytest
 import trimesh
 
 from benchmarks.foreign import with_our_shapes, with_their_shapes
+from benchmarks.hand_matching import match_hands
+from benchmarks.second_hand import transfer_drives, transfer_grasps, validate_twice
 from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.matter import MASS_KG
 from graspd.service.model.metrics import PerturbedParameter
 from graspd.service.model.transforms import IDENTITY_POSE, apply
-from graspd.studies.evaluation import combine_rows, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
-from graspd.worker.hands.hand_matching import match_hands
 from graspd.worker.hands.model import Drag, HandModel
 from graspd.worker.hands.primitives import tessellate, volume
 from graspd.worker.hands.tendons import Tendon
 from graspd.worker.validation import model
 from graspd.worker.validation import robust as robustness
 from graspd.worker.validation import variant as variants
-from graspd.worker.validation.foreign import transfer_drives, transfer_grasps
 from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.model import MujocoOptions, Scene, build_scene
 from graspd.worker.validation.prefilter.prefilter import prefilter_key_terms
@@ -442,17 +441,13 @@ def test_a_drive_stays_what_it_is_with_followers_or_on_a_tendon() -> None:
     assert 2 * cord.limit(back.effort) == pytest.approx(ratio.effort[dof])
 
 
-def test_the_same_model_gives_the_same_verdicts_and_rows_add_up(tmp_path) -> None:
-    row = evaluate(plates_case(), validation_hand=match_hands(PADS_HAND, PADS_HAND), cache=tmp_path)
+def test_the_same_model_gives_the_same_verdicts(tmp_path) -> None:
+    both = validate_twice(plates_case(), match_hands(PADS_HAND, PADS_HAND), cache=tmp_path)
+    row = both.facts()
     assert row["foreign_held"] == {"both": 2, "nominal": 0, "foreign": 0, "neither": 1}
     assert (row["agreement"], row["foreign_share"], row["fingertips_mm"]) == (1.0, 1.0, pytest.approx(0.0, abs=1e-6))
-    assert [one["held_foreign"] for one in row["verdicts"]] == [True, True, False]
+    assert both.foreign.success.tolist() == [True, True, False]
     json.dumps(row, allow_nan=False)
-    lost = {**row, "foreign_held": {"both": 0, "nominal": 1, "foreign": 1, "neither": 0}, "fingertips_mm": 0.4}
-    whole = combine_rows([row, lost])
-    assert whole["foreign_held"] == {"both": 2, "nominal": 1, "foreign": 1, "neither": 1}
-    assert (whole["agreement"], whole["foreign_share"]) == (pytest.approx(3 / 5), pytest.approx(2 / 3, abs=1e-6))
-    assert whole["fingertips_mm"] == 0.4
 
 
 def test_a_model_with_other_pads_says_otherwise(tmp_path) -> None:
@@ -460,13 +455,13 @@ def test_a_model_with_other_pads_says_otherwise(tmp_path) -> None:
     back, (foot, *pads) = np.array([0, 0, -0.04, 0, 0, 0, 0]), PADS_HAND.pieces
     moved = (dataclasses.replace(p, vertices=p.vertices + back[:3], pose=p.pose + back) for p in pads)
     same = match_hands(PADS_HAND, dataclasses.replace(PADS_HAND, name="shorter", pieces=(foot, *moved)))
-    row = evaluate(plates_case(), validation_hand=same, cache=tmp_path)
+    row = validate_twice(plates_case(), same, cache=tmp_path).facts()
     assert row["foreign_held"] == {"both": 0, "nominal": 2, "foreign": 0, "neither": 1}
     assert (row["foreign_share"], row["agreement"]) == (0.0, pytest.approx(1 / 3))
     ours_in_theirs = dataclasses.replace(same, theirs=with_our_shapes(same))
-    assert evaluate(plates_case(), validation_hand=ours_in_theirs, cache=tmp_path)["foreign_share"] == 1.0
+    assert validate_twice(plates_case(), ours_in_theirs, cache=tmp_path).facts()["foreign_share"] == 1.0
     theirs_in_ours = dataclasses.replace(same, theirs=with_their_shapes(same))
-    assert evaluate(plates_case(), validation_hand=theirs_in_ours, cache=tmp_path)["foreign_share"] == 0.0
+    assert validate_twice(plates_case(), theirs_in_ours, cache=tmp_path).facts()["foreign_share"] == 0.0
 
 
 def test_joints_take_order_and_the_couplings_of_the_other_model() -> None:

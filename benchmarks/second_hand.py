@@ -1,21 +1,29 @@
 """Verdicts in a model of the hand other than the one used to plan the grasps.
 
+    python -m benchmarks.second_hand grasps.h5 --hand other/hand.xml [--joint-map OURS=THEIRS,...]
+
 The other model provides the mechanism: shapes, masses, joint frames, limits, couplings, armature and dry friction. The
 grasp's own model provides the controller: commanded postures, gains, damping and torque limits."""
 
+import argparse
+import json
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
+from benchmarks.hand_matching import TOLERANCE_M, HandMatch, match_hands
+from graspd.exchange.inputs import Case, load_case
 from graspd.service.model.transforms import compose
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.hands.hand_matching import HandMatch
+from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.validator import Verdicts, validate
 from graspd.worker.validation.variant import nearest_feasible_joints
@@ -106,3 +114,27 @@ def transfer_grasps(same: HandMatch, grasps: GraspSet) -> GraspSet:
     return GraspSet(
         transfer_posture(grasps.grasp), transfer_posture(grasps.pregrasp), transfer_posture(grasps.squeeze), loss
     )
+
+
+def validate_twice(case: Case, same: HandMatch, *, cache: Path | None = None) -> ForeignVerdicts:
+    """Validate the grasps of a file in both models, at level standard."""
+    case, pieces = case.centred, decompose(case.centred.obj, cache=cache)
+    nominal = validate(case.hand, case.obj, case.grasps, pieces=pieces)
+    return foreign_verdicts(same, case.obj, case.grasps, nominal, pieces=pieces)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("grasps", type=Path, help="base shard")
+    parser.add_argument("--hand", required=True, help="second model of the hand")
+    parser.add_argument("--joint-map", default="", help="joints with different names")
+    parser.add_argument("--tolerance", type=float, default=1e3 * TOLERANCE_M, help="distance between fingertips [mm]")
+    given = parser.parse_args()
+    names = dict(pair.split("=") for pair in given.joint_map.split(",") if pair)
+    case = load_case(given.grasps)
+    same = match_hands(case.hand, hand_from_path(given.hand, drag=True), names, tolerance_m=given.tolerance / 1e3)
+    sys.stdout.write(json.dumps(validate_twice(case, same).facts()) + "\n")
+
+
+if __name__ == "__main__":
+    main()
