@@ -25,7 +25,7 @@ from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.refit import applicable_fits
 from graspd.worker.validation.robust import reaches_share, validate_robustness
-from graspd.worker.validation.variant import NOMINAL, SHAPES, Models, Variant, axes_of, couplings_of, draw_variant
+from graspd.worker.validation.variant import SHAPES, Models, Variant, axes_of, couplings_of, draw_variant
 
 OBJECTS = ["003_cracker_box", "005_tomato_soup_can", "011_banana", "025_mug"]
 #: Seed of the random models; jobs with this seed have other models.
@@ -37,10 +37,10 @@ WORDS = {"hull": "one hull per link", "primitive": "primitives", "capsule": "cap
 
 def together(variants: Iterable[Variant]) -> Variant:
     """Combine variants along several axes; if two change the same value, the later one is used."""
-    own, changed = asdict(NOMINAL), dict[str, Any]()
+    own, changed = asdict(Variant()), dict[str, Any]()
     for one in variants:
         changed |= {name: value for name, value in asdict(one).items() if value != own[name]}
-    return replace(NOMINAL, **changed)
+    return replace(Variant(), **changed)
 
 
 def kinds(cell: Cell, draws: int) -> dict[str, list[Callable[[np.random.Generator], Variant]]]:

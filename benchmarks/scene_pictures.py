@@ -25,9 +25,10 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PlanRequest, synthesize
+from graspd.worker.rendering import sheets
 from graspd.worker.rendering.cameras import FIELD_OF_VIEW, GivenCameras, distance_to_fill, look_at
 from graspd.worker.rendering.hands import DrawnHand
-from graspd.worker.rendering.sheets import label_page, reduce_to_palette, scene_cells
+from graspd.worker.rendering.sheets import label_page, reduce_to_palette
 from graspd.worker.rendering.views import Extras, render
 from graspd.worker.scenes import Neighbours, drop, drop_together, transfer_grasps
 
@@ -42,6 +43,15 @@ ROUNDS: Final = 4
 #: Cosine of the camera's elevation for views past a neighbour.
 _LEVEL: Final = 0.94
 _CHANNELS: Final = ("left", "right", "depth", "normals", "segmentation", "boxes")
+
+
+def scene_cells(views: Any) -> list[Image.Image]:
+    """Return pictures of a shard's first stereo pair: left, right, depth, normals, segmentation, boxes."""
+    left, right = np.asarray(views["image/rgb"][:2], np.uint8)
+    normals = np.asarray(views["image/normals"][0], float)
+    coloured = np.where(normals.any(axis=-1, keepdims=True), 127.5 + 127.5 * normals, 214).round().astype(np.uint8)
+    cells = [Image.fromarray(left), Image.fromarray(right), sheets._draw_depth(views, 0), Image.fromarray(coloured)]
+    return [*cells, sheets._draw_segmentation(views, 0), sheets._draw_boxes(views, 0)]
 
 
 def paint(hands: Sequence[HandModel], objects: Sequence[ObjectModel], folder: Path, *, device: str, seed: int) -> None:

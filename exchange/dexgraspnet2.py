@@ -205,9 +205,7 @@ def write(
     scenes = [some for some in seen if some[0].base in known and len(some[0].rows)]
     if not scenes:
         if any(some[0].base in known for some in seen):
-            raise InputError(
-                "no grasp is valid and clear in the scenes of the pictures; plan grasps in scenes: synth --scene"
-            )
+            raise InputError("no grasp is valid and clear in the pictured scenes; plan grasps in scenes: synth --scene")
         raise InputError("no picture shows a scene with grasps; render views into the grasps' folder: graspd render")
     done = ExportSummary({"grasps": 0, "scenes": len(scenes), "views": 0, "files": len(scenes)})
     held_out = sum(known[some[0].base].name in out for some in scenes)

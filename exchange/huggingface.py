@@ -205,9 +205,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
         kinds = [FREE] * len(columns["object"])
     rows = [k for k, name in enumerate(columns["object"]) if name == wanted]
     if other := {kinds[k] for k in rows} - {FREE, TABLE}:
-        raise InputError(
-            f"{path} has grasps for scenes of the kind {sorted(other)[0]!r}; only table and free are supported"
-        )
+        raise InputError(f"{path} has grasps for scenes of the kind {sorted(other)[0]!r}; use table or free")
     sets = {kind: [k for k in rows if kinds[k] == kind] for kind in (FREE, TABLE)}
     return [
         _imported_grasps(path, hand, obj, wanted, columns, some, on_table=kind == TABLE)

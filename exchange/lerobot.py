@@ -61,9 +61,7 @@ def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: fro
     if (folder / "meta").exists():
         raise InputError(f"{folder} holds a data set already; give another folder as --output")
     if len({lot.hand.digest for lot in lots}) > 1:
-        raise InputError(
-            "a LeRobot data set has one robot, but these grasps are of several hands; export each hand separately"
-        )
+        raise InputError("a LeRobot data set has one robot, but there are several hands; export each separately")
     ways = [lot for lot in sorted(lots, key=lambda lot: lot.name in out) if lot.placed is not None]
     if not ways:
         raise InputError("free grasps have no approach; plan grasps in a scene: --scene table")

@@ -42,9 +42,7 @@ def _open(path: Path, library: str, read: Callable[[Path], Any]) -> None:
         return  # an optional library that the writer did not need
     except Exception as error:  # libraries raise arbitrary exceptions
         why = " ".join(str(error).split())[:300]
-        raise GraspdError(
-            f"{path} was written but {library} cannot read it ({why}); report this with the shard"
-        ) from error
+        raise GraspdError(f"{path} was written but {library} cannot read it ({why}); report this") from error
 
 
 def _check_usd(path: Path) -> None:

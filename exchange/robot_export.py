@@ -128,9 +128,7 @@ def _plan_executions(
     quality: dict[str, NDArray[Any]] = {"valid": valid[rows], "success": success[rows], "epsilon": epsilon[rows]}
     found = build_executions(case.hand, case.obj, grasps, rows=rows, tool=tool, quality=quality, placed=placed)
     if lost := len(rows) - len(found):
-        written.notes.append(
-            f"{lost} of {len(rows)} {word} are left out: no straight approach of 10 cm is free of the object"
-        )
+        written.notes.append(f"{lost} of {len(rows)} {word} are left out: no straight approach of 10 cm is free")
     return found
 
 

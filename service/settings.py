@@ -95,9 +95,7 @@ class Settings(BaseSettings):
         None, max_length=200, description="name of a controller, which leads at once after a restart; unset: a new name"
     )
     task_attempts: int = Field(3, ge=1, le=20, description="attempts of a task before its job fails")
-    task_s: float = Field(
-        60.0, ge=0, description="target duration of a task [s], which sets its number of batches; 0: one batch"
-    )
+    task_s: float = Field(60.0, ge=0, description="target duration of a task [s]; 0: one batch")
     task_timeout_s: float = Field(1800.0, gt=0, description="maximum run time of one task [s]")
     worker_max_memory_mb: int = Field(
         0, ge=0, description="resident memory at which a worker is replaced [MiB]; 0: half of all memory"

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.planning import sum_outcomes
+from graspd.service.model.transforms import Mask
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, parallel_map
 from graspd.worker.grasps import GraspSet, join_columns, join_grasp_sets
 from graspd.worker.hands.model import HandModel
@@ -231,7 +232,7 @@ class Scoring(AbstractContextManager["Scoring"]):
         finite = np.flatnonzero(fates == "kept")
         planned = planned.take(finite)
         size, every = len(planned), self.request.want == "candidates"
-        in_scene: dict[str, NDArray[np.bool_]] = {}
+        in_scene: dict[str, Mask] = {}
         with _timed(seconds, "validation"):
             planned, columns = self._validate(planned, run.with_progress_range(*PARTS[:2]), known, prefilter)
         if self.scenes is not None:
@@ -301,9 +302,7 @@ class Scoring(AbstractContextManager["Scoring"]):
             columns["quality/validated_by"] = verdicts.validated_by
         return grasps, columns
 
-    def _further_tests(
-        self, grasps: GraspSet, in_models: NDArray[np.bool_], valid: NDArray[np.bool_], run: ExecutionContext
-    ) -> Arrays:
+    def _further_tests(self, grasps: GraspSet, in_models: Mask, valid: Mask, run: ExecutionContext) -> Arrays:
         """Return columns of the further tests that the request specifies.
         Grasps `in_models` (N,) are tested for robustness, `valid` grasps (N,) for payload and in the shake test."""
         request, columns = self.request, dict[str, NDArray[Any]]()

@@ -105,9 +105,7 @@ def build_executions(
     postures = dict(zip(POSTURES, placed_parts, strict=True))
     whole = Executions(hand, obj, tool, frame, np.asarray(rows, np.intp), at, postures, placed, dict(quality))
     if not free.any():
-        raise InputError(
-            f"none of {len(grasps)} grasps has a straight approach of {100 * STANDOFF_M:.0f} cm free of the object"
-        )
+        raise InputError(f"none of {len(grasps)} grasps has a free straight approach of {100 * STANDOFF_M:.0f} cm")
     return whole.take(np.flatnonzero(free))
 
 

@@ -51,10 +51,7 @@ def balance(
     source: SourceArgument,
     out: OutOption,
     by: Annotated[
-        str | None,
-        typer.Option(
-            help=f"Kinds, separated by commas: {', '.join(KINDS)}; default: type,direction; none with --spread."
-        ),
+        str | None, typer.Option(help=f"Kinds, comma-separated: {', '.join(KINDS)}; default: type,direction.")
     ] = None,
     at_most: Annotated[int, typer.Option(min=0, help="Maximum per kind and cell; 0: the median over kinds.")] = 0,
     min_distance: Annotated[

@@ -43,18 +43,14 @@ def evaluate_command(
     hard: Annotated[bool, typer.Option("--hard", help="Half friction, and a tenth of the torsional friction.")] = False,
     hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
     object: Annotated[str | None, typer.Option(help="Object file; default: found by its digest.")] = None,
-    robust: Annotated[
-        int, typer.Option(min=0, max=MOST_ROBUST_MODELS, help="Perturbed models for held grasps, such as 8.")
-    ] = 0,
+    robust: Annotated[int, typer.Option(min=0, max=MOST_ROBUST_MODELS, help="Perturbed models, such as 8.")] = 0,
     friction: Annotated[
         float | None, typer.Option(min=0.01, max=3.0, help="Friction coefficient for ε; default: that of the file.")
     ] = None,
     engines: Annotated[
         str, typer.Option("--engines", "--engine", help="Engines to compare: mujoco, physx, drake; commas between.")
     ] = "",
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="With --robust or --engines: copy with their columns.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Copy with columns of --robust or --engines.")] = None,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
     json: JsonFlag = False,
 ) -> None:

@@ -24,9 +24,7 @@ app = CommandGroup(add_completion=False)
 @app.command("check", epilog="graspd objects check banana.stl --units mm --picture banana.png")
 @with_options(ObjectOptions, "asset")
 def check(
-    file: Annotated[
-        str, typer.Argument(help="Mesh (STL, OBJ, PLY, OFF, GLB), URDF, SDF, MJCF, folder, ZIP, or built-in object.")
-    ],
+    file: Annotated[str, typer.Argument(help="Mesh, URDF, SDF, MJCF, folder, ZIP, or built-in object.")],
     options: dict[str, Any],
     picture: Annotated[Path | None, typer.Option(help="PNG of the prepared mesh.")] = None,
     json: JsonFlag = False,

@@ -215,9 +215,7 @@ def _hand_in_pictures(scene: Shard, base_file: Path | None, hand: str | None) ->
 @app.command(epilog="graspd view grasps.h5")
 def view(
     grasps: Annotated[Path, typer.Argument(help="Base shard, as written by `graspd synth`.")],
-    host: Annotated[
-        str, typer.Option(help="Address to bind; everyone who can reach it sees the grasps.")
-    ] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="Address to bind; all who reach it see the grasps.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="First port to try; 0: any free port.")] = 8080,
     hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
     object: _Object = None,

@@ -81,6 +81,4 @@ def parse_cone(text: str) -> tuple[tuple[float, float, float], float]:
         x, y, z, degrees = map(float, parts)
         if 1e-6 < math.hypot(x, y, z) <= LARGEST and 1.0 <= degrees <= 180.0:
             return (x, y, z), degrees
-    raise ValueError(
-        f"a cone is an axis and an angle of 1 to 180 degrees, such as 0, 0, -1, 30 (from above); got {text!r}"
-    )
+    raise ValueError(f"a cone is an axis and an angle of 1 to 180 degrees, such as 0, 0, -1, 30; got {text!r}")

@@ -155,9 +155,7 @@ class JobOptions(Model):
     )
     digits: Annotated[
         tuple[DigitName, ...], Option(schema=7, typed="digit that may touch, such as thumb; the others stay open")
-    ] = _sparse_field(
-        (), max_length=6, description="digits that may touch: thumb, index, middle, ring, little; others stay open"
-    )
+    ] = _sparse_field((), max_length=6, description="digits that may touch: thumb, index, middle, ring, little")
     touch_region: Annotated[
         Region,
         Option(schema=7),
@@ -206,9 +204,7 @@ class JobOptions(Model):
     )
     want: Annotated[
         Literal["valid", "candidates"], Option("basic"), FormField("grasps", "Counted grasps", choices=_WANT_LABELS)
-    ] = Field(
-        "valid", description="grasps that count. valid: valid grasps (without validation: feasible); candidates: all"
-    )
+    ] = Field("valid", description="grasps that count: valid (without validation: feasible) ones, or all candidates")
     budget: Annotated[float, Option()] = Field(
         4.0, ge=1, le=100, description="maximum number of candidates per requested valid grasp"
     )
@@ -255,9 +251,7 @@ class JobOptions(Model):
         le=MOST_ROBUST_MODELS,
         description=f"number of perturbed models per valid grasp; 0: {ROBUST_MODELS} if `robust` is given, else none",
     )
-    payload: Annotated[bool, Option(schema=5)] = _sparse_field(
-        False, description="measure the payload of each valid grasp"
-    )
+    payload: Annotated[bool, Option(schema=5)] = _sparse_field(False, description="measure the payload of valid grasps")
     min_payload: Annotated[
         float,
         Option(schema=5),
@@ -270,9 +264,7 @@ class JobOptions(Model):
         description="mass that a grasp must lift to count [kg], which implies `payload`; 0: no requirement",
     )
     shake: Annotated[bool, Option(schema=5), FormField("scenes", "After the lift", "Shake: 2 cm, 3 Hz", cells=True)] = (
-        _sparse_field(
-            False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y of its scene"
-        )
+        _sparse_field(False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y")
     )
     options: Annotated[
         dict[

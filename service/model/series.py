@@ -30,15 +30,11 @@ _ALL: Final = (
     Series("graspd_controller_up", "gauge", (), "1: a controller sent a heartbeat recently", "queue"),
     Series("graspd_jobs_unfinished", "gauge", ("state",), "queued and running jobs, counted up to 10,000", "index"),
     Series("graspd_job_oldest_seconds", "gauge", ("state",), "age of the oldest queued and running job", "index"),
-    Series(
-        "graspd_grasps_per_second", "gauge", ("verdict",), "stored grasps per second, last minute: all, valid", "index"
-    ),
+    Series("graspd_grasps_per_second", "gauge", ("verdict",), "stored grasps per second of the last minute", "index"),
     Series("graspd_store_damaged", "gauge", (), "objects of the store known to be damaged or missing", "index"),
     Series("graspd_part_up", "gauge", ("part",), "1: the part (redis, index or store) responds", "probe"),
     Series("graspd_part_latency_seconds", "gauge", ("part",), "response time of a ping, read or small write", "probe"),
-    Series(
-        "graspd_grasps_total", "counter", ("verdict",), "grasps: all, valid; tested candidates: validated", "controller"
-    ),
+    Series("graspd_grasps_total", "counter", ("verdict",), "grasps (all, valid), tested candidates", "controller"),
     Series("graspd_shards_total", "counter", ("stage",), "shards written", "controller"),
     Series("graspd_shard_bytes_total", "counter", ("stage",), "bytes of the shards written", "controller"),
     Series("graspd_stage_seconds", "histogram", ("stage",), "duration of one task on a worker", "controller"),

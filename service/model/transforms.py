@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 IDENTITY_POSE: Floats = np.array([0.0, 0, 0, 1, 0, 0, 0])
 POSE_PARTS: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")

@@ -34,7 +34,7 @@ def up(
         Path | None, typer.Option(help="Share the queue; write the settings of workers on other machines to this file.")
     ] = None,
     share_host: Annotated[
-        str | None, typer.Option(help="With --share: address of this machine; default: its host name.")
+        str | None, typer.Option(help="With --share: this machine's address; default: host name.")
     ] = None,
     redis_port: Annotated[
         int, typer.Option(min=0, max=65535, help="With --share: port of Redis for other machines; 0: any free port.")

@@ -24,9 +24,7 @@ class HandCommandOptions(Model):
     approach: Annotated[str | None, _TYPED] = Field(
         None, description="approach direction out of the palm, in the palm's frame: x,y,z"
     )
-    root: Annotated[str | None, _TYPED] = Field(
-        None, description="root link; links above it, such as the wrist, are omitted"
-    )
+    root: Annotated[str | None, _TYPED] = Field(None, description="root link; links above it are omitted")
     pre_shape: Annotated[tuple[str, ...], _TYPED] = Field((), description="joint values on approach: JOINT=VALUE,...")
     closing: Annotated[tuple[str, ...], _TYPED] = Field(
         (), description="closing direction of joints, -1, 0 (spreads) or 1: JOINT=-1,..."

@@ -90,9 +90,7 @@ class PalmCorrection(Model):
     """Palm of the hand in its pre-shape. Missing values are guessed again."""
 
     link: Text
-    centre: tuple[Length, Length, Length] | None = Field(
-        None, description="origin of the palm, in the link's frame [m]"
-    )
+    centre: tuple[Length, Length, Length] | None = Field(None, description="origin of the palm in the link [m]")
     approach: tuple[Share, Share, Share] | None = Field(None, description="direction out of the palm, of any length")
 
 
@@ -178,9 +176,7 @@ def _check_corrections(facts: HandFacts, corrections: HandCorrections) -> None:
     if (palm := corrections.palm) is None:
         return
     if palm.link not in facts.links:
-        raise InputError(
-            f"the hand has no link {palm.link!r} at or below its root; there are: {_first_names(facts.links)}"
-        )
+        raise InputError(f"the hand has no link {palm.link!r} at or below its root, but {_first_names(facts.links)}")
     if palm.approach is not None and math.hypot(*palm.approach) < _ROUNDING:
         raise InputError("the approach is no direction; give one such as 0, 0, 1")
 

@@ -222,10 +222,10 @@ def _match_main_file(wanted: str, known: list[str], where: str) -> str:
             return fits[0]
         if fits:
             raise InputError(
-                f"{where} holds {len(fits)} files called {wanted!r} ({', '.join(fits[:5])}); name one by its path"
+                f"{where} holds {len(fits)} files {wanted!r} ({', '.join(fits[:5])}); name one by its path"
             )
     raise InputError(
-        f"{where} names the file {wanted!r}, which does not exist; hand files are: {', '.join(known[:8]) or 'none'}"
+        f"{where} names the file {wanted!r}, which does not exist; there are: {', '.join(known[:8]) or 'none'}"
     )
 
 

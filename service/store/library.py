@@ -62,9 +62,7 @@ def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
     if store.exists(names.deletion_key(asset.kind.value, asset.digest)):
         if is_new:
             store.delete(record)
-        raise ConflictError(
-            f"the same {asset.kind.value} was deleted and is still being removed; try again in a moment"
-        )
+        raise ConflictError(f"the same {asset.kind.value} was deleted and is being removed; try again in a moment")
     if is_new:
         return asset
     known = load_asset(store, asset.kind, asset.digest)

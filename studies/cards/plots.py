@@ -127,7 +127,7 @@ def _plot_directions(card: Row, tally: Tally) -> Any:
             _plot_elevations(below, card["elevation"][hand], first=column == 0)
     figure.colorbar(mesh, ax=figure.axes[-1 if not with_table else -2], shrink=0.7, label="1: uniform", extend="max")
     figure.suptitle(
-        "top: in the object's frame, z up; bottom: elevation over the table", fontsize=9, color=INK, x=0.01, ha="left"
+        "top: object's frame, z up; bottom: elevation over the table", fontsize=9, color=INK, x=0.01, ha="left"
     )
     return figure
 

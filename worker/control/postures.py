@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.matter import ACCELERATION
-from graspd.service.model.transforms import Floats
+from graspd.service.model.transforms import Floats, Mask
 from graspd.worker.control.jaw_squeeze import jaw_squeeze
 from graspd.worker.control.opening import (
     Blocked,
@@ -137,7 +137,7 @@ def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device:
     return posture_data_of(hand, obj, points=_POINTS, device=device).count_touching_links(grasp)
 
 
-def fingers_off_object(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.bool_]:
+def fingers_off_object(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> Mask:
     """Return a mask (N,) of grasps with a finger whose distance from the object is in `STANDS_OFF_M`."""
     return np.asarray(_fingers_off_object(posture_data_of(hand, obj, points=_POINTS, device=device), grasp).any(axis=1))
 
@@ -167,18 +167,14 @@ def close_fingers(
     return Posture(np.array(grasp.hand_pose, float), joints)
 
 
-def _fingers_off_object(
-    posing: PostureData, grasp: Posture, off_m: tuple[float, float] = STANDS_OFF_M
-) -> NDArray[np.bool_]:
+def _fingers_off_object(posing: PostureData, grasp: Posture, off_m: tuple[float, float] = STANDS_OFF_M) -> Mask:
     """Return a mask (N, F) of fingers at a distance from the object in `off_m`."""
     near, far = off_m
     gap = posing.finger_gaps(grasp, far + BEYOND_M)
     return np.asarray((gap > near) & (gap < far))
 
 
-def _close_until_contact(
-    posing: PostureData, hand_pose: Floats, q: Floats, moved: NDArray[np.bool_], reach: float
-) -> Floats:
+def _close_until_contact(posing: PostureData, hand_pose: Floats, q: Floats, moved: Mask, reach: float) -> Floats:
     """Return dofs (n, D); those `moved` (n, D) are closed until their finger's distance is `CLOSED_M`.
     Distances are measured up to `reach` [m]."""
     hand, count, looks = posing.hand, len(q), CLOSING_STEPS + 1
@@ -200,8 +196,8 @@ def _blocked_paths(hand: HandModel, opening: Openings, placed: PlacedGrasps | No
     # A finger may be closer to an obstacle in the grasp than allowed; opening must not bring it closer.
     room = np.minimum(_finger_clearance(hand, pose, opening.q[:, None], placed), ROOM_M)
 
-    def blocked(rows: NDArray[np.intp], way: Floats) -> NDArray[np.bool_]:
-        near: NDArray[np.bool_] = _finger_clearance(hand, pose[rows], way, placed.take(rows)) < room[rows] - 1e-6
+    def blocked(rows: NDArray[np.intp], way: Floats) -> Mask:
+        near: Mask = _finger_clearance(hand, pose[rows], way, placed.take(rows)) < room[rows] - 1e-6
         return near
 
     return blocked

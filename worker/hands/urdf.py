@@ -112,9 +112,7 @@ def _read_joint(element: Element, notes: list[str]) -> Joint:
 def _movable_joint(element: Element, still: Joint, what: str, notes: list[str]) -> Joint:
     """Return the joint with its axis and limits; raise HandError if no hand can have it."""
     if still.type not in MOVING:
-        raise HandError(
-            f"{what}: type {still.type[:40]!r} cannot be used; a hand has revolute, prismatic and fixed joints"
-        )
+        raise HandError(f"{what}: type {still.type[:40]!r} cannot be used; use revolute, prismatic and fixed joints")
     mimic = _mimic(element, what)
     try:
         lower, upper, effort = _limits(element, still.type, what)

@@ -140,9 +140,7 @@ def _part(element: Element, matrix: Floats, files: Mapping[str, bytes], main: st
         return soup.vertices, soup.faces, scaled, _UNKNOWN, (element.get("name", ""),)
     keys = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
     if shape.tag not in keys:
-        raise MeshError(
-            f"{main}: geometry <{shape.tag[:40]}> is not read; use a mesh, box, sphere, cylinder or capsule"
-        )
+        raise MeshError(f"{main}: geometry <{shape.tag[:40]}> is not read; use mesh, box, sphere, cylinder or capsule")
     sizes = [size for key in keys[shape.tag] for size in _floats(_value(shape, key, ""), 3 if key == "size" else 1)]
     return (*_primitive(shape.tag, sizes), matrix, _UNKNOWN, (element.get("name", ""),))
 

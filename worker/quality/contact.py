@@ -5,9 +5,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.transforms import Floats
+from graspd.service.model.transforms import Floats, Mask
 from graspd.worker.hands.digits import finger_of_body
 from graspd.worker.hands.model import HandModel
+
+Ints = NDArray[np.intp]
 
 LINK_CONTACT_M: Final = 0.002  # a body closer than this is in contact [m] (DexGraspBench)
 #: Cap of contact distances in the contact distance consistency [m] (DexGraspBench's contact margin).
@@ -24,9 +26,7 @@ def contact_area_cm2(distance: Floats, area: Floats, thresholds_m: Floats) -> Fl
     return np.stack([np.where(near < t, area, 0.0).sum(axis=-1) for t in thresholds_m], axis=-1) * 1e4
 
 
-def spread_contacts(
-    near: NDArray[np.bool_], place: Floats, normal: Floats, *, scale: float, limit: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def spread_contacts(near: Mask, place: Floats, normal: Floats, *, scale: float, limit: int) -> tuple[Ints, Ints]:
     """Choose at most `limit` points `near` (B, T, N) per grasp and threshold, as far apart as possible.
     Spread is measured by position (B, N, 3) divided by `scale`, the torque scale [m], and by normal (B, N, 3).
     Return indices (B, T, limit) and their number (B, T); further indices are undefined."""
@@ -47,7 +47,7 @@ def spread_contacts(
     return index.reshape(grasps, sets, limit), np.minimum(count, limit)
 
 
-def _farthest(points: Floats, inside: NDArray[np.bool_], count: int) -> NDArray[np.intp]:
+def _farthest(points: Floats, inside: Mask, count: int) -> Ints:
     """Select (S, count) points of sets (S, W, K) as `farthest_points` does, only among `inside` (S, W)."""
     rows = np.arange(len(points))
     mean = np.einsum("sw,swk->sk", inside.astype(float), points) / np.maximum(inside.sum(axis=1), 1)[:, None]

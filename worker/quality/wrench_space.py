@@ -14,9 +14,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from graspd.service.model.transforms import Floats, cross
+from graspd.service.model.transforms import Floats, Mask, cross
 from graspd.worker.simulation.kernels import hull as kernels
 from graspd.worker.simulation.launches import launch
+
+Ints = NDArray[np.intp]
 
 EDGES: Final = 8
 FLATNESS: Final = 1e-7  # ratio of least to largest singular value below which a set of wrenches is flat
@@ -51,9 +53,7 @@ def contact_wrenches(
     return np.concatenate([force, torque], axis=-1)
 
 
-def measure_spaces(
-    edge_wrenches: Floats, contacts: NDArray[np.integer], with_volume: NDArray[np.bool_]
-) -> tuple[Floats, Floats]:
+def measure_spaces(edge_wrenches: Floats, contacts: NDArray[np.integer], with_volume: Mask) -> tuple[Floats, Floats]:
     """Compute epsilon and volume (S,) of many wrench spaces of edge wrenches (S, N, E, D).
     Each space uses its first `contacts` (S,) contacts. The volume is nan where `with_volume` (S,) is false: epsilon
     alone is as accurate, in a tenth of the time."""
@@ -145,7 +145,7 @@ class _Workspace(threading.local):
 _workspace = _Workspace()
 
 
-def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: Mask) -> tuple[Floats, Floats]:
     """Compute inner radius and volume (H,) of many hulls, in one launch; nan where a hull fails.
     Each hull uses the first `count` (H,) of its points `clouds` (H, P, 6), P at most `MAX_POINTS`. The radius is the
     distance from the origin to the nearest facet, at most 0 for an outside origin. Where `whole` (H,) is false, only
@@ -169,7 +169,7 @@ def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.
 
 
 def _grow_hulls(
-    points: Floats, count: NDArray[Any], whole: NDArray[np.bool_], corners: NDArray[np.intp], scale: Floats
+    points: Floats, count: NDArray[Any], whole: Mask, corners: Ints, scale: Floats
 ) -> tuple[Floats, Floats]:
     """Grow hulls from simplices (H, 7); return radius and volume (H,), nan where a hull fails."""
     corner = np.take_along_axis(points, corners[..., None], axis=1)
@@ -201,9 +201,7 @@ def _grow_hulls(
     return found[:, 0], found[:, 1]
 
 
-def _simplices(
-    points: Floats, own: NDArray[np.bool_], count: NDArray[Any]
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def _simplices(points: Floats, own: Mask, count: NDArray[Any]) -> tuple[Ints, Mask]:
     """Return the corners (H, 7) of simplices, and a mask (H,) of flat hulls.
     Each corner is the point farthest from the span of earlier corners."""
     rows = np.arange(len(points))

@@ -195,9 +195,7 @@ def _intrinsic_matrix(path: Path, given: _Pinhole | list[list[float]] | None) ->
         return np.array([[given.fx, 0, given.cx], [0, given.fy, given.cy], [0, 0, 1.0]])
     k = np.asarray(given, float)
     if k[0, 1] or k[1, 0] or k[2].tolist() != [0, 0, 1] or k[0, 0] <= 0 or k[1, 1] <= 0:
-        raise InputError(
-            f"{path}: intrinsics must read [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0 (no skew)"
-        )
+        raise InputError(f"{path}: intrinsics must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0 (no skew)")
     return k
 
 

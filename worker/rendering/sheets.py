@@ -118,15 +118,6 @@ def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
     return label_page(rows, heads, (), title=title, subtitle=subtitle)
 
 
-def scene_cells(views: Arrays) -> list[Image.Image]:
-    """Return pictures of a shard's first stereo pair: left, right, depth, normals, segmentation, boxes."""
-    left, right = np.asarray(views["image/rgb"][:2], np.uint8)
-    normals = np.asarray(views["image/normals"][0], float)
-    coloured = np.where(normals.any(axis=-1, keepdims=True), 127.5 + 127.5 * normals, 214).round().astype(np.uint8)
-    cells = [Image.fromarray(left), Image.fromarray(right), _draw_depth(views, 0), Image.fromarray(coloured)]
-    return [*cells, _draw_segmentation(views, 0), _draw_boxes(views, 0)]
-
-
 def label_page(
     rows: Sequence[Sequence[Image.Image]],
     heads: Sequence[str],

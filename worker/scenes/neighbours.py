@@ -91,9 +91,7 @@ class _DroppedObjects:
             if (found := self._drop_once(np.random.default_rng([*key, attempt]))) is not None:
                 return found
         names = ", ".join(repr(obj.name) for obj in self.objects)
-        raise MeshError(
-            f"{names} did not come to rest apart in any of {simulate.MAX_ATTEMPTS} drops; try fewer neighbours"
-        )
+        raise MeshError(f"{names} did not come to rest apart in {simulate.MAX_ATTEMPTS} drops; try fewer neighbours")
 
     def _drop_once(self, rng: np.random.Generator) -> tuple[Floats, int, float] | None:
         mujoco.mj_resetData(self.model, self.data)

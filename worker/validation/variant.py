@@ -63,9 +63,6 @@ class Variant:
     lags: tuple[float, ...] = ()  # delay of each fingertip's finger after the first one, as a share of the closing time
 
 
-NOMINAL: Final = Variant()
-
-
 def axes_of(hand: HandModel) -> tuple[PerturbedParameter, ...]:
     """Return the axes along which models of this hand can differ; couplings only where joints are coupled."""
     missing = set() if couplings_of(hand) else {PerturbedParameter.COUPLINGS}

@@ -89,9 +89,7 @@ def check_port(settings: Settings) -> Finding:
     if found is None and not expected:
         return skipped(f"no API runs at {url}")
     if found is None:
-        return bad(
-            f"no API answers at {url}", "start graspd up or graspd api; check proxy, firewall and GRASPD_API_URL"
-        )
+        return bad(f"no API answers at {url}", "start graspd api; check proxy, firewall and GRASPD_API_URL")
     if not found:
         return bad(f"the server at {url} is not graspd", "stop it; or set GRASPD_PORT, or GRASPD_API_URL to the API")
     if not found.get("ok"):

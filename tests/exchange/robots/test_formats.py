@@ -342,7 +342,7 @@ def test_grasps_without_a_free_way_are_left_out_none_is_refused() -> None:
     inner.invert()
     ball = object_from_mesh(trimesh.util.concatenate([shell, inner]))
     caught = grasp_set(posture(((0.0, 0, 0), (0.0, 0.0))))
-    with pytest.raises(InputError, match="free of the object"):
+    with pytest.raises(InputError, match="free straight approach"):
         build_executions(hand, ball, caught, rows=np.zeros(1, int), placed=None, tool=TOOL, quality={})
 
 

@@ -420,7 +420,7 @@ def test_of_several_descriptions_one_is_named(tmp_path: Path) -> None:
         options = f'{{"file": "{said}"}}'
         files = files_of_upload(AssetKind.HAND, "h.zip", packed, limit_bytes=1 << 20, options=options)
         assert b'"urdf/right.urdf"' in files["asset.json"]
-    with pytest.raises(InputError, match=r"2 files called 'h\.urdf'.*name one by its path"):
+    with pytest.raises(InputError, match=r"2 files 'h\.urdf'.*name one by its path"):
         find_main_file(dict.fromkeys(("old/h.urdf", "new/h.urdf"), b"<robot/>"), "h.urdf")
 
 

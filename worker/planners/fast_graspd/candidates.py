@@ -9,13 +9,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.transforms import Floats, quat_rotate
+from graspd.service.model.transforms import Floats, Mask, quat_rotate
 from graspd.worker.control.postures import hold_forces, normal_force, pregrasp, squeeze
 from graspd.worker.grasps import GraspSet, Posture, join_grasp_sets
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import PlacedGrasps
+
+Ints = NDArray[np.intp]
 
 #: Number of candidates of a grasp in one fine phase. Their refinement costs half of a rollout.
 TOGETHER: Final = 2
@@ -62,17 +64,17 @@ class Refinements:
     state: HandState
     losses: Floats
     merit: Floats
-    infeasible: NDArray[np.bool_]
+    infeasible: Mask
     """Whether penetration depth or number of touching links fails the geometric gate; no rollout follows."""
-    off: NDArray[np.bool_]
+    off: Mask
     """Whether a finger stands off an object in a scene. Such hands are simulated last."""
 
 
-Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Refinements]
+Seat = Callable[[Ints, Ints], Refinements]
 
 """Runs the fine phase for some grasps (n,), given the rows (n, each) of their starts."""
 
-RolloutOf = Callable[[GraspSet, NDArray[np.intp], Floats], Floats]
+RolloutOf = Callable[[GraspSet, Ints, Floats], Floats]
 """Returns scores (k,) of grasps from their numbers (k,) and scores to beat (k,); see `worker.planners.Rollout`."""
 
 
@@ -92,12 +94,10 @@ class Selection:
         empty = HandState(np.zeros((count, 3)), np.zeros((count, 4)), np.zeros((count, dofs)))
         return cls(empty, np.zeros(count), beat.copy(), {})
 
-    def has_candidates(self, which: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def has_candidates(self, which: Ints) -> Mask:
         return np.array([int(grasp) in self.grasps for grasp in which], bool)
 
-    def take(
-        self, found: GraspSet, refined: Refinements, rows: NDArray[np.intp], which: NDArray[np.intp], score: Floats
-    ) -> None:
+    def take(self, found: GraspSet, refined: Refinements, rows: Ints, which: Ints, score: Floats) -> None:
         """Store candidates `rows` (k,) of the grasps `which` (k,) that are better or a grasp's first."""
         state, losses = refined.state[rows], refined.losses[rows]
         for k in np.flatnonzero((score < self.score[which]) | ~self.has_candidates(which)):
@@ -114,7 +114,7 @@ class Selection:
 def select_by_rollout(
     hand: HandModel,
     obj: ObjectModel,
-    order: NDArray[np.intp],
+    order: Ints,
     refine: Seat,
     placed: PlacedGrasps | None,
     rollout: RolloutOf,
@@ -153,9 +153,7 @@ def select_by_rollout(
     return taken
 
 
-def _scores(
-    found: GraspSet, infeasible: NDArray[np.bool_], which: NDArray[np.intp], beat: Floats, rollout: RolloutOf
-) -> Floats:
+def _scores(found: GraspSet, infeasible: Mask, which: Ints, beat: Floats, rollout: RolloutOf) -> Floats:
     score, feasible = np.full(len(which), HOPELESS), np.flatnonzero(~infeasible)
     if len(feasible):
         score[feasible] = np.nan_to_num(
@@ -165,13 +163,7 @@ def _scores(
 
 
 def _reduce_squeeze(
-    hand: HandModel,
-    obj: ObjectModel,
-    found: GraspSet,
-    score: Floats,
-    which: NDArray[np.intp],
-    rollout: RolloutOf,
-    device: str,
+    hand: HandModel, obj: ObjectModel, found: GraspSet, score: Floats, which: Ints, rollout: RolloutOf, device: str
 ) -> None:
     """Reduce the squeeze force of hands (k,) that nearly lift if this improves their scores.
     Soft fingers act as springs: a larger force turns the object farther out of the hand."""
@@ -227,7 +219,7 @@ def merits(
     return merit
 
 
-def rank_hands(merit: Floats, grasps: int) -> NDArray[np.intp]:
+def rank_hands(merit: Floats, grasps: int) -> Ints:
     """Return row numbers (grasps, each) of hands, best first; in `merit` hands of a grasp are adjacent."""
     each = merit.reshape(grasps, -1)
     # The stable sort keeps hands of equal merit in the order of their starts.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import (
     Floats,
+    Mask,
     quat_from_axis_angle,
     quat_from_matrix,
     quat_multiply,
@@ -43,6 +44,8 @@ from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import missing_mounting_clearance
 
+Ints = NDArray[np.intp]
+
 #: Clearance of a start from obstacles in addition to the margin [m].
 ROOM: Final = 0.006
 #: Nearest and farthest distance of a palm from the random point in front of it [m].
@@ -67,7 +70,7 @@ _UNIFORM: Final = 7
 
 
 #: Indices among the draws, and the antipodal hands at these indices.
-_AcrossPairs = list[tuple[NDArray[np.intp], AntipodalHands]]
+_AcrossPairs = list[tuple[Ints, AntipodalHands]]
 
 
 def free_directions(scene: Environment, obj: ObjectModel) -> Floats:
@@ -165,16 +168,14 @@ def clear_scene_starts(
     return best, depth
 
 
-def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], numbers: int) -> Floats:
+def _normal(generators: list[np.random.Generator], rows: Ints, numbers: int) -> Floats:
     out = np.zeros((len(generators), DRAWN, numbers))
     for row in rows.tolist():
         out[row] = generators[row].standard_normal((DRAWN, numbers))
     return out
 
 
-def _depths(
-    probe: starts.Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], worth: NDArray[np.bool_]
-) -> Floats:
+def _depths(probe: starts.Probe, states: HandState, placed: PlacedGrasps, scene: Ints, worth: Mask) -> Floats:
     """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,); inf if not computed.
     Only retreats with `worth` (n, len(RETREATS)) are computed, from the farthest inwards, until one is not clear.
     Most draws fail for reasons that no retreat fixes. A draw that is not clear at one distance is hardly ever clear at
@@ -194,7 +195,7 @@ def _depths(
 
 
 def _missing_mounting_clearance(
-    probe: starts.Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], *, exact: bool
+    probe: starts.Probe, states: HandState, placed: PlacedGrasps, scene: Ints, *, exact: bool
 ) -> Floats:
     """Return by how much (n,) mountings in scenes (n,) miss the margin plus `ROOM` [m]; at least 0."""
     hand, obj = probe.model.hand.model, probe.model.obj.model
@@ -203,12 +204,7 @@ def _missing_mounting_clearance(
 
 
 def _raise_draws(
-    states: HandState,
-    across_pairs: _AcrossPairs,
-    rows: NDArray[np.intp],
-    placed: PlacedGrasps,
-    scene: NDArray[np.intp],
-    probe: starts.Probe,
+    states: HandState, across_pairs: _AcrossPairs, rows: Ints, placed: PlacedGrasps, scene: Ints, probe: starts.Probe
 ) -> Floats:
     """Raise draws `rows` in scenes (n,), at all retreats, by the clearance missing at the nearest retreat.
     Return the distance (n, len(RETREATS)) of their pairs from the middle of the pads [m], 0 for other draws. Retreat
@@ -238,9 +234,7 @@ class _SceneDraws:
     openings: Mapping[int, Openings]
     wanted: Requirements = NOTHING
 
-    def select_draws(
-        self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: PlacedGrasps
-    ) -> tuple[NDArray[np.intp], Floats]:
+    def select_draws(self, uniform: Floats, scene: Ints, reaching: Mask, placed: PlacedGrasps) -> tuple[Ints, Floats]:
         """Return draws and distances (n, REACHES) of `select_draws`; 0 and inf unless `reaching`."""
         order, least = np.zeros((len(scene), REACHES), np.intp), np.full((len(scene), REACHES), np.inf)
         for s in np.unique(scene[reaching]):
@@ -252,7 +246,7 @@ class _SceneDraws:
         return order, least
 
     def hands_of_draws(
-        self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]
+        self, uniform: Floats, normal: Floats, scene: Ints, reach: Mask
     ) -> tuple[HandState, _AcrossPairs]:
         """Return hands (n * len(RETREATS)) drawn in scenes (n,) at all retreats, and the antipodal hands.
         `reach` (n,): whether a hand is antipodal. Random numbers: uniform (n, 7), normal (n, 2 + D or 6 + D)."""
