@@ -66,16 +66,19 @@ try:
     import graspd.cli as graspd
 except ImportError:  # one module in older revisions
     import graspd
+build = getattr(graspd, "build_app", None) or graspd.build  # the names of 0.2
+load = getattr(graspd, "load_command", None) or graspd.load
+deferred = getattr(graspd, "DeferredCommand", None) or getattr(graspd, "Deferred", ())
 def walk(command, name):
-    if isinstance(command, getattr(graspd, "Deferred", ())):
-        command = graspd.load(command.module, command.name, root)
+    if isinstance(command, deferred):
+        command = load(command.module, command.name, root)
     print("==", name)
     print(command.get_help(typer.Context(command, info_name=name)))
     for child, inner in sorted((getattr(command, "commands", None) or {}).items()):
         walk(inner, f"{name} {child}")
-root = typer.Context(typer.main.get_command(graspd.build()))
+root = typer.Context(typer.main.get_command(build()))
 for name, module in sorted({row[0]: row[1] for row in graspd.COMMANDS}.items()):
-    walk(graspd.load(module, name, root), name)
+    walk(load(module, name, root), name)
 """
 
 

@@ -1,6 +1,4 @@
-"""Planner throughput by fidelity, batch and threads, with times of kernels and of the host.
-
-Results are a table, JSON and a plot."""
+"""Planner throughput by fidelity, batch and threads, with times of kernels and of the host."""
 
 import json
 import resource
@@ -17,7 +15,7 @@ import warp as wp
 from graspd.service.model.cores import available_cores
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.studies.figures import markdown_table, new_figure, plain_axes
+from graspd.studies.figures import markdown_table
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -254,21 +252,3 @@ def write(result: dict[str, Any], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "bench.json").write_text(json.dumps(result, indent=1) + "\n")
     (folder / "bench.md").write_text(results_table(result) + "\n")
-    _plot(result, folder / "bench.png")
-
-
-def _plot(result: dict[str, Any], path: Path) -> None:
-    figure = new_figure(7, 4.2)
-    axes = figure.add_subplot()
-    for key in dict.fromkeys((r["fidelity"], r["processes"]) for r in result["runs"]):
-        runs = sorted((r for r in result["runs"] if (r["fidelity"], r["processes"]) == key), key=lambda r: r["grasps"])
-        label = f"{key[0]}, {key[1]} thread{'s' if key[1] > 1 else ''}"
-        axes.plot([r["grasps"] for r in runs], [r["grasps_per_second"] for r in runs], marker="o", label=label)
-    batches = sorted({r["grasps"] for r in result["runs"]})
-    axes.set_xscale("log", base=2)
-    axes.set_xticks(batches, [str(batch) for batch in batches], minor=False)
-    axes.set(xlabel="grasps per call", ylabel="grasps per second", ylim=(0, None))
-    axes.set_title(f"{result['hand']} on {result['object']}, {result['device']}", loc="left", fontsize=11)
-    plain_axes(axes)
-    axes.legend(frameon=False, fontsize=8)
-    figure.savefig(path, dpi=150)

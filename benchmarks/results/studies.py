@@ -94,7 +94,7 @@ STUDIES: Final = (
     Study(
         "bench",
         "grasps per second of the planner",
-        ("results/bench.*",),
+        ("results/bench.json", "results/bench.md"),
         (
             f"graspd bench --hand {_ALLEGRO} --object {_mesh('025_mug')} --fidelity draft --fidelity standard "
             "--fidelity fine --batch 1 --batch 8 --batch 32 --batch 128 --threads 1 --threads 2 --out OUT/results",
@@ -106,15 +106,8 @@ STUDIES: Final = (
         "bench-points",
         "grasps per second by hand points and faces",
         ("results/bench-points/bench.json", "results/bench-points/bench.md"),
-        (
-            f"graspd bench --hand {_ALLEGRO} --object {_mesh('025_mug')} --fidelity standard --batch 32 --threads 2 "
-            "--points 500 --points 1000 --points 4000 --face-error 0 --face-error 0.001 --face-error 0.003 "
-            "--out OUT/results/bench-points",
-        ),
-        (
-            "graspd bench --fidelity draft --batch 4 --threads 2 --points 300 --repeats 1 "
-            "--out OUT/results/bench-points",
-        ),
+        ("python -m benchmarks.bench_points DATA --out OUT/results/bench-points",),
+        ("python -m benchmarks.bench_points DATA --points 300 --repeats 1 --out OUT/results/bench-points",),
         stages=(),
     ),
     Study(

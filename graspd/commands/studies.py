@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from json import dumps, loads
+from json import loads
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -17,7 +17,7 @@ from graspd.service.cli import CommandGroup, JsonFlag, load_settings, print_resu
 from graspd.service.model.clock import timestamp
 from graspd.service.model.cores import available_cores
 from graspd.service.model.errors import InputError, choices_text
-from graspd.service.model.fidelity import FIDELITIES, OFFERED, Fidelity
+from graspd.service.model.fidelity import FIDELITIES, OFFERED
 from graspd.service.model.metrics import ROBUST_MODELS
 from graspd.service.model.renamed import convert_chart
 from graspd.service.model.studies import Stability, parse_stability
@@ -38,11 +38,9 @@ def bench(
     batch: Annotated[list[int] | None, typer.Option(min=1, help="Grasps per call; repeatable.")] = None,
     join: Annotated[list[int] | None, typer.Option(min=1, help="Batches per launch; repeatable.")] = None,
     threads: Annotated[list[int] | None, typer.Option(min=1, help="CPU threads; repeatable.")] = None,
-    points: Annotated[list[int] | None, typer.Option(min=16, help="Also measure these numbers of hand points.")] = None,
-    face_error: Annotated[list[float] | None, typer.Option(min=0, help="Also measure these face errors [m].")] = None,
     device: Annotated[str, typer.Option(help="Device: cpu, cuda:0 or auto.")] = "auto",
     repeats: Annotated[int, typer.Option(min=1, help="Timed calls per run, of which the median is reported.")] = 3,
-    out: Annotated[Path | None, typer.Option(help="Folder for bench.json, bench.md and bench.png.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for bench.json and bench.md.")] = None,
     json: JsonFlag = False,
 ) -> None:
     """Measure grasps per second of the planner, without quality metrics, and the time of each step."""
@@ -55,7 +53,7 @@ def bench(
     result = measure(
         hand_from_path(hand),
         lambda error: object_from_path(object_, face_error_m=error),
-        fidelities=_fidelities(fidelity, points, face_error),
+        fidelities=[FIDELITIES[name] for name in _check_fidelities(fidelity or OFFERED)],
         batches=batch or [1, 8, 32, 256],
         threads=threads or ([1] if resolved != "cpu" else sorted({1, available_cores()})),
         device=resolved,
@@ -66,15 +64,6 @@ def bench(
     if out is not None:
         write(result, out)
     print_result(result, results_table(result), json=json)
-
-
-def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[float] | None) -> list[Fidelity]:
-    """Return the named fidelities, then variants of the first fidelity with one changed setting each."""
-    chosen = _check_fidelities(names or OFFERED)
-    found = [FIDELITIES[name] for name in chosen]
-    changes: list[dict[str, Any]] = [{"fine_points": n, "name": f"{chosen[0]}/points={n}"} for n in points or []]
-    changes += [{"face_error_m": e, "name": f"{chosen[0]}/error={dumps(e)}"} for e in errors or []]
-    return found + [Fidelity(**(found[0].model_dump() | change)) for change in changes]
 
 
 def _check_fidelities(fidelities: Sequence[str]) -> list[str]:
