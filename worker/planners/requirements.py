@@ -113,6 +113,11 @@ class Requirements:
         return self.by_pads and self.rule is not None and self.rule.arrangement == "line"
 
     @property
+    def out_of_line(self) -> bool:
+        """Whether fingertips must touch out of line."""
+        return self.by_pads and self.rule is not None and self.rule.arrangement not in ("any", "line")
+
+    @property
     def links(self) -> int:
         """Least number of bodies in contact."""
         return max(2, self.rule.digits if self.rule else 0)

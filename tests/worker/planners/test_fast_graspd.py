@@ -216,7 +216,7 @@ def plain(hand, obj, state: HandState, losses: np.ndarray, placed: PlacedGrasps,
     return replace(grasp_set(posture(*rows)), stability_loss=losses)
 
 
-def taken(scores, monkeypatch, merit=None, infeasible=(), off=()) -> tuple[list[int], list[int], list[int]]:
+def taken(scores, monkeypatch, merit=None, infeasible=(), off=(), unlike=()) -> tuple[list[int], list[int], list[int]]:
     """Hands that are taken where hand k of grasp n scores `scores[n][k]` and is the k-th most promising; those that
     were tried, and those that were refined. Some are infeasible."""
     monkeypatch.setattr(candidates, "grasps_of_state", plain)
@@ -241,7 +241,11 @@ def taken(scores, monkeypatch, merit=None, infeasible=(), off=()) -> tuple[list[
 
     placed = PlacedGrasps(TABLE, np.tile([0, 0, 0, 1.0, 0, 0, 0], (n, 1)), np.arange(n))
     found = candidates.select_by_rollout(
-        two_finger_hand(), ball(), np.arange(n * each).reshape(n, each), seat, placed, rollout
+        two_finger_hand(),
+        ball(),
+        np.arange(n * each).reshape(n, each),
+        *(seat, placed, rollout),
+        unlike=np.isin(np.arange(n * each), unlike),
     )
     rows = found.joined().stability_loss.astype(int).tolist()
     assert found.state.pivot[:, 0].tolist() == found.losses.tolist() == rows
@@ -269,6 +273,8 @@ def taken(scores, monkeypatch, merit=None, infeasible=(), off=()) -> tuple[list[
         # hands 4 and 1 nearly lift, so they are tried with a smaller squeeze, too.
         ([[0.5, 0.9, 0.5], [0.1, 1.5, 0.9]], {"off": (0, 3)}, [1, 5], [1, 3, 4, 4, 5]),
         ([[0.1, 1.5, 3.0]], {"off": (0,)}, [0], [0, 1, 1, 2]),
+        # Hands unlike the required type are refined only beside others.
+        ([[3.0, 3.0, 0.1, 0.1], [3.0, 3.0, 3.0, 0.1]], {"unlike": (1, 2, 3, 7)}, [0, 7], [0, 1, 4, 5, 6, 7]),
         # Where none is good enough the least score is taken, of equal ones the first, and no score is the worst.
         ([[3.0, 2.6, 4.0]], {}, [1], [0, 1, 2]),
         ([[2.0, 2.0]], {}, [0], None),

@@ -41,8 +41,8 @@ class Batches:
         self.fidelity = wanted[0].fidelity
         if wanted[0].placed is not None:
             self.fidelity = fidelity_in_scenes(self.fidelity)
-        elif self.has_rollout:
-            # Retries replace half of the initial starts.
+        elif self.has_rollout and not self.requirements.out_of_line:
+            # Retries replace half of the initial starts. Out of line, further starts cost less than retries.
             self.fidelity = self.fidelity.model_copy(update={"starts": -(-self.fidelity.starts // 2)})
         if warm is not None:
             self.fidelity = warm.adapted(self.fidelity)

@@ -120,17 +120,21 @@ def select_by_rollout(
     rollout: RolloutOf,
     *,
     beat: Floats | None = None,
+    unlike: NDArray[np.bool_] | None = None,
     together: int = TOGETHER,
     device: str = "cpu",
 ) -> Selection:
     """Return each grasp's first candidate with a good enough rollout, else the one with the least score.
     `order` (n, each) lists the candidates by merit. `together` candidates of each grasp are refined and simulated, then
     further ones of grasps without a good candidate. Unbalanced or infeasible hands have no rollout; a grasp of only
-    such hands gets its first hand. Scores `beat` (n,) of earlier attempts change only if a candidate is better."""
+    such hands gets its first hand. A hand of the mask `unlike` is refined only beside others, or first. Scores `beat`
+    (n,) of earlier attempts change only if a candidate is better."""
     good = GOOD if placed is None else GOOD_IN_SCENES
     beat = np.full(len(order), np.inf) if beat is None else beat
     taken, left = Selection.empty(beat, hand.dofs), np.arange(len(order))
-    for wave in np.split(order, range(together, order.shape[1], together), axis=1):
+    for number, wave in enumerate(np.split(order, range(together, order.shape[1], together), axis=1)):
+        if number and unlike is not None:
+            left = left[~unlike[wave[left]].all(axis=1)]
         if not len(left):
             break
         refined = refine(wave[left], left)
