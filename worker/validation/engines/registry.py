@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.service.model.engines import ENGINES
 from graspd.service.model.errors import InputError, choices_text
 from graspd.service.model.transforms import Floats
-from graspd.service.store.columns import ENGINES
 from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext, evaluate_rows
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
