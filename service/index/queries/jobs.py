@@ -1,7 +1,7 @@
 """Queries of jobs, tasks, attempts and shards, and the outcomes of a job's candidates."""
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final, Literal
 
 from sqlalchemy import Column, ColumnElement, Connection, Float, and_, case, cast, func, select
@@ -46,11 +46,10 @@ class Jobs(database.IndexPart):
             query = select(jobs).where(jobs.c.id == job_id, *database.scope_conditions(scope, jobs))
             (view,) = _job_views(connection, [self.database.first_row(query, f"job {job_id!r}", connection)])
             more: dict[str, Any] = {}
+            if view.request.second_engines:
+                more = outcomes_of(connection, tasks.c.job_id == job_id, "second_engine")
             if view.note is not None:
                 more["outcomes"] = outcomes_of(connection, tasks.c.job_id == job_id)
-            if view.request.second_engines:
-                for part in _counts_of(connection, tasks.c.job_id == job_id, "second_engine"):
-                    more |= {name: more.get(name, 0) + count for name, count in part.items()}
             return view.model_copy(update=more)
 
     def unfinished(self, ids: Collection[str]) -> set[str]:
@@ -142,17 +141,11 @@ def _task_view(row: Any) -> TaskView:
 MOST_SHARDS: Final = 1000
 
 
-def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[str, int]:
-    """Count rejected candidates by outcome in at most `MOST_SHARDS` shards of the selected jobs."""
-    return sum_outcomes(_counts_of(connection, of_jobs))
-
-
-def _counts_of(
-    connection: Connection, of_jobs: ColumnElement[bool], name: str = "outcomes"
-) -> Iterator[dict[str, int]]:
+def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool], name: str = "outcomes") -> dict[str, int]:
+    """Sum counts in at most `MOST_SHARDS` shards of the selected jobs: rejected candidates by outcome, or others."""
     query = select(shards.c.manifest["info"][name]).join(tasks, tasks.c.shard_id == shards.c.id)
     query = query.where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value).limit(MOST_SHARDS)
-    return (one for one in connection.scalars(query) if isinstance(one, dict))
+    return sum_outcomes(one for one in connection.scalars(query) if isinstance(one, dict))
 
 
 class Shards(database.IndexPart):
