@@ -75,8 +75,8 @@ equal verdicts, one per file, on which the same change makes verdicts differ.
   the difference.
 - Unexplained: two free grasps of Barrett that only Drake holds; on a table, a drop of Allegro and a turn of Shadow.
 """,
-    "releases": """Option `--release`: equal candidates and convex pieces; levels `standard` and `lift`. All verdicts are
-equal. Releases before 3.8 lack a flag that the validator sets.""",
+    "releases": """Option `--release`: equal candidates and convex pieces; levels `standard` and `lift`. All verdicts
+are equal. Releases before 3.8 lack a flag that the validator sets.""",
 }
 WIDER: Final = 0.1  # change of friction that shows which verdicts are close to a limit
 DEEP_M: Final = 0.001  # penetration of pregrasps that tells two groups of grasps apart
