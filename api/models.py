@@ -88,6 +88,8 @@ class JobDetail(Job):
     outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome, if the job found too few grasps")
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
     recheck_held: int = Field(0, description="rechecked grasps that held")
+    second_tested: int = Field(0, description="valid grasps that the second engine validated")
+    second_held: int = Field(0, description="those that it held")
     attempts: list[AttemptView]
     mean: MeanMetrics
     diversity: Diversity | None = Field(None, description="null without grasps")

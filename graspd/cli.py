@@ -32,6 +32,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("chart", "graspd.commands.studies", "Make grasps", "Compare speed and accuracy of methods and fidelities."),
     ("bench", "graspd.commands.studies", "Make grasps", "Measure grasps per second and the time of each step."),
     ("stability", "graspd.commands.studies", "Make grasps", "Map where planners fail."),
+    ("studies", "graspd.commands.studies", "Make grasps", "Compare engines on the same grasps."),
     ("pictures", "graspd.commands.render", "Use grasps", "Draw the best grasps of a file on one sheet."),
     ("view", "graspd.commands.render", "Use grasps", "Show grasps of a file in 3D in the browser."),
     ("grasps", "graspd.commands.curate", "Use grasps", "Select grasps of files and datasets by their metrics."),

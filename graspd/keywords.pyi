@@ -43,6 +43,7 @@ class JobKeywords(TypedDict, total=False):
     want: Literal["valid", "candidates"]
     validation: Literal["dexgraspbench", "standard", "fast", "none"]
     robust: float
+    second_engine: Literal["none", "physx", "drake", "all"]
     faces: Literal["drawn", "all"]
     touch: float
     stereo: bool
@@ -64,6 +65,7 @@ class JobKeywords(TypedDict, total=False):
     payload: bool
     min_payload: float
     shake: bool
+    second_engine_share: float
     options: Mapping[str, int | float | str]
     target: str
 
@@ -105,6 +107,7 @@ class SynthesizeKeywords(TypedDict, total=False):
     want: Literal["valid", "candidates"]
     validation: Literal["dexgraspbench", "standard", "fast", "none"]
     robust: float
+    second_engine: Literal["none", "physx", "drake", "all"]
     faces: Literal["drawn", "all"]
     touch: float | None
     digits: Sequence[Literal["thumb", "index", "middle", "ring", "little", "sixth"]]
@@ -121,6 +124,7 @@ class SynthesizeKeywords(TypedDict, total=False):
     payload: bool
     min_payload: float
     shake: bool
+    second_engine_share: float
     options: Mapping[str, Any]
     units: Literal["m", "mm", "cm", "in"]
     scale_to: float | None

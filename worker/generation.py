@@ -39,6 +39,12 @@ from graspd.worker.scenes.rollout import create_rollout, lift_level, outcome_mas
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.displacement import simulated_displacement_cm
+from graspd.worker.validation.engines.registry import (
+    EngineVerdicts,
+    check_engines,
+    engine_columns,
+    validate_with_engine,
+)
 from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.lifting import lift_key, validate_lifts
@@ -171,7 +177,9 @@ class Scoring(AbstractContextManager["Scoring"]):
         pieces: Callable[[ObjectModel], ConvexPieces],
         run: ExecutionContext,
     ) -> None:
-        """Start the decomposition of the object, if grasps are validated."""
+        """Start the decomposition of the object, if grasps are validated.
+        Raises InputError: a second engine is not installed."""
+        check_engines(request.second_engines)
         self.hand, self.obj, self.request, self.run = hand, obj.centred, request, run
         self.centre = obj.centre
         self.scenes = None if scenes is None else scenes.centred(obj)
@@ -269,6 +277,8 @@ class Scoring(AbstractContextManager["Scoring"]):
             wanted &= failed == ""
             if self.request.robust:
                 enough = reaches_share(columns["quality/robust_share"], self.request.robust)
+                if self.request.second_engines:
+                    enough &= columns["quality/agreement"] == 1
                 fates[finite[rows[wanted & ~enough]]] = "not_robust"
                 wanted &= enough
             if least := self.request.min_payload:
@@ -324,6 +334,9 @@ class Scoring(AbstractContextManager["Scoring"]):
                 wanted=request.robust if request.want == "valid" else 0,
                 **common,
             ).columns
+        if request.second_engines and request.robust:
+            robust = np.flatnonzero(valid & reaches_share(columns["quality/robust_share"], request.robust))
+            columns |= self.second_verdicts(grasps, in_models, robust, run)
         if request.measures_payload:
             found = payloads(self.hand, self.obj, grasps, placed=placed, held=valid, **common)
             # A valid grasp has lifted at least the object's own mass.
@@ -331,6 +344,24 @@ class Scoring(AbstractContextManager["Scoring"]):
         if request.shake:
             assert placed is not None, "a shake test needs a scene"
             columns["quality/shake_margin"] = shake_margins(self.hand, self.obj, grasps, placed, held=valid, **common)
+        return columns
+
+    def second_verdicts(
+        self, grasps: GraspSet, held: NDArray[np.bool_], rows: NDArray[np.intp], run: ExecutionContext
+    ) -> Arrays:
+        """Return the columns of `engine_columns`; second engines validate `rows` of the grasps `held` (N,) in MuJoCo.
+        Raises InputError: an engine cannot simulate the hand."""
+        assert self.pieces is not None
+        columns: Arrays = {"quality/held_in": held.astype(np.uint8), "quality/agreement": np.full(len(grasps), np.nan)}
+        if len(rows):
+            chosen, level = grasps.take(rows), self.request.validation
+            common: dict[str, Any] = {"level": level, "pieces": self.pieces.result(), "run": run}
+            verdicts = [EngineVerdicts("mujoco", np.ones(len(rows), np.int8), (), np.zeros(len(rows)), 0.0)]
+            for name in self.request.second_engines:
+                placed = self.placed(chosen)
+                verdicts.append(validate_with_engine(name, self.hand, self.obj, chosen, placed, **common))
+            for path, values in engine_columns(verdicts).items():
+                columns[path][rows] = values
         return columns
 
     def placed(self, grasps: GraspSet) -> PlacedGrasps | None:
@@ -548,7 +579,8 @@ class Batch:
             limit=None if len(grasps) else self.limit,
         )
         if scoring.pieces is not None:
-            columns |= self._further_columns(grasps, columns["quality/valid"])
+            held = columns["quality/success"] == 1
+            columns |= self._further_columns(grasps, columns["quality/valid"], held)
             narrow = None if columns["quality/valid"].any() else self._narrow_reason()
             found = replace(found, columns=columns, verdict_key=scoring.key(), narrow=narrow)
         scene = None if grasps.scene is None else grasps.scene - self._scenes.start
@@ -567,9 +599,9 @@ class Batch:
             for name in self.rounds[0].in_scene
         }
 
-    def _further_columns(self, grasps: GraspSet, valid: NDArray[np.uint8]) -> Arrays:
-        """Return displacements of all grasps and, if wanted, rechecks.
-        Rechecks validate the first valid grasps at level `dexgraspbench`."""
+    def _further_columns(self, grasps: GraspSet, valid: NDArray[np.uint8], held: NDArray[np.bool_]) -> Arrays:
+        """Return displacements of all grasps and, if wanted, rechecks and verdicts of second engines.
+        Rechecks validate the first valid grasps at level `dexgraspbench`, second engines an evenly spaced share."""
         scoring = self.scoring
         assert scoring.pieces is not None
         hand, obj, run, pieces = scoring.hand, scoring.obj, scoring.run, scoring.pieces.result()
@@ -582,6 +614,11 @@ class Batch:
                     known = self._rechecks.result() if self._rechecks else self._recheck(grasps.take(rechecked))
                     recheck[rechecked] = known[: len(rechecked)]
                 columns["quality/recheck"] = recheck
+            if self.request.second_engines and not self.request.robust:
+                rows = np.flatnonzero(valid)
+                tried = math.ceil(len(rows) * self.request.second_engine_share - 1e-9)
+                rows = rows[np.arange(tried) * len(rows) // max(1, tried)]
+                columns |= scoring.second_verdicts(grasps, held, rows, run.without_progress())
         return columns
 
     def _begin_rechecks(self, first: Round) -> None:

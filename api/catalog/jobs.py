@@ -26,7 +26,10 @@ _PAGE: Final = 200
 _LOOKED_AT: Final = 20
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _SHARED: Final = Job.model_fields.keys() & JobView.model_fields.keys() - {"reason", "stages"}
-_DETAILS: Final = ("request", "choice", "note", "outcomes", "rechecked", "recheck_held", "hand_digest", "object_digest")
+_DETAILS: Final = (
+    *("request", "choice", "note", "outcomes", "rechecked", "recheck_held", "second_tested", "second_held"),
+    *("hand_digest", "object_digest"),
+)
 
 
 class Shards:

@@ -220,7 +220,12 @@ STUDIES: Final = (
         "engines",
         "verdicts of several engines on the same candidates",
         ("results/engines.md",),
-        ("python -m benchmarks.engines DATA --grasps 18 --engines mujoco,physx,drake --page OUT/results/engines.md",),
+        (
+            "python -m benchmarks.engines DATA --grasps 18 --engines mujoco,physx,drake --section agreement "
+            "--page OUT/results/engines.md",
+            "python -m benchmarks.engines DATA --objects 035_power_drill 011_banana 025_mug --grasps 5 "
+            "--engines mujoco,physx,drake --variants --section held-back starts causes --page OUT/results/engines.md",
+        ),
         (
             "python -m benchmarks.engines DATA --hands barrett --objects 077_rubiks_cube --grasps 2 "
             "--engines mujoco,physx,drake --page OUT/results/engines.md",

@@ -100,6 +100,7 @@ def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True)
 
 _SUMMARY: Final = (
     *("grasps", "valid", "candidates", "validated", "valid_yield", "rechecked", "recheck_held"),
+    *("second_tested", "second_held"),
     *("note", "progress", "reason", "outcomes"),
 )
 
@@ -143,9 +144,11 @@ def yield_of(job: JobDetail) -> str:
     if level == "none":
         return f"{count(job.grasps)} stored grasps of {count(job.candidates)} candidates; not validated"
     line = f"{count(job.valid)} valid grasps of {count(job.candidates)} candidates, level {level}"
-    if not job.rechecked:
-        return line
-    return f"{line}; {job.recheck_held} of {job.rechecked} rechecked hold under the DexGraspBench protocol"
+    if job.rechecked:
+        line += f"; {job.recheck_held} of {job.rechecked} rechecked hold under the DexGraspBench protocol"
+    if job.second_tested:
+        line += f"; {job.second_held} of {job.second_tested} hold in {' and '.join(job.request.second_engines)}"
+    return line
 
 
 def mean_metrics(job: JobDetail) -> str:

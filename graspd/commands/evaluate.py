@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -17,7 +17,7 @@ from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
 from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
 from graspd.service.store.shards import inherited_attributes, json_attribute, read_shard, write_shard
-from graspd.studies.engines import compare_engines, summarise
+from graspd.studies.engines import compare_engines, matrix_lines, summarise
 from graspd.studies.evaluation import checked_level, combine_rows, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.subsets import require_empty_folder
@@ -147,28 +147,23 @@ def _update_bar(bar: Progress, task: TaskID, name: str, done: float, total: floa
 def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:
     stated = f"{whole['protocol']}, {whole['level'] or 'not validated'}{', hard' if whole['hard'] else ''}"
     friction = " ".join(sorted({f"{row['mu']:g}" for row in rows}))
-    table = _plain_table(
-        f"{stated}; ε at μ = {friction}, contact at 5 mm; medians",
+    looks: dict[str, Any] = {"title_justify": "left", "caption_justify": "left", "box": SIMPLE_HEAD}
+    table = Table(
+        title=f"{stated}; ε at μ = {friction}, contact at 5 mm; medians",
         caption="GSR: held share; SGS: held grasps per s; PD, SPD: penetration, self-penetration [mm]; CA: contact "
         "area [cm²]; IV: intersection volume [cm³]; SD: displacement [cm]; D: variance share of the first component",
-        width=16,
-        headings=[heading for _, heading, _ in _COLUMNS],
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+        **looks,
     )
+    table.add_column("grasps", max_width=16, overflow="fold")
+    for _, heading, _ in _COLUMNS:
+        table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         table.add_row(Path(row["file"]).stem, *(_cell_text(row[key], digits) for key, _, digits in _COLUMNS))
     if len(rows) > 1:
         table.add_section()
         table.add_row("all", *(_cell_text(whole[key], digits) for key, _, digits in _COLUMNS))
-    return table
-
-
-def _plain_table(title: str, *, width: int, headings: Sequence[str], caption: str | None = None) -> Table:
-    """Return an empty table of files by row, with names of at most `width` characters, and numbers."""
-    looks: dict[str, Any] = {"title_justify": "left", "caption_justify": "left", "box": SIMPLE_HEAD}
-    table = Table(title=title, caption=caption, padding=(0, 1, 0, 0), pad_edge=False, **looks)
-    table.add_column("grasps", max_width=width, overflow="fold")
-    for heading in headings:
-        table.add_column(heading, justify="right", no_wrap=True)
     return table
 
 
@@ -194,7 +189,6 @@ def write_copy(source: Path, out: Path, columns: Mapping[str, Any], attributes: 
 
 def _report_engines(verdicts: dict[str, list[EngineVerdicts]], *, json: bool) -> None:
     whole = summarise(list(verdicts.values()))
-    names = list(whole["success"])
     if json:
         files = [
             {
@@ -207,18 +201,5 @@ def _report_engines(verdicts: dict[str, list[EngineVerdicts]], *, json: bool) ->
         ]
         print_json(whole | {"files": files})
         return
-    table = _plain_table("share of grasps that holds in each engine", width=40, headings=("n", *names))
-    lines = {Path(file).stem: summarise([found]) for file, found in verdicts.items()} | {"all": whole}
-    for name, row in lines.items():
-        if name != "all" or len(verdicts) > 1:
-            table.add_row(name, str(row["n"]), *(f"{row['success'][one]:.2f}" for one in names))
-    plain_console().print(table)
-    for pair in whole["pairs"]:
-        (a, b), (x, y) = pair["engines"], pair["only"]
-        typer.echo(
-            f"{a} and {b}: agreement {pair['agreement']:.2f}, κ {_cell_text(pair['kappa'], 2)}; "
-            f"held by both {pair['both']}, only by {a} {x}, only by {b} {y}"
-        )
-        for reason, count in pair["differences"].items():
-            typer.echo(f"  {count} {reason}")
-    typer.echo("core-ms per verdict: " + ", ".join(f"{one} {whole['core_ms'][one]:.0f}" for one in names))
+    rows = {(Path(file).stem,): summarise([found]) for file, found in verdicts.items()}
+    typer.echo("\n".join(matrix_lines(rows | ({("all",): whole} if len(rows) > 1 else {}), ("grasps",))))

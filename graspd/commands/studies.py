@@ -1,4 +1,4 @@
-"""Command line: `graspd bench`, `graspd stability` and `graspd chart`."""
+"""Command line: `graspd bench`, `graspd stability`, `graspd chart` and `graspd studies`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from json import loads
+from itertools import product
+from json import dumps, loads
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final
 
 import typer
@@ -16,6 +18,7 @@ import typer
 from graspd.service.cli import CommandGroup, JsonFlag, load_settings, print_result
 from graspd.service.model.clock import timestamp
 from graspd.service.model.cores import available_cores
+from graspd.service.model.engines import ENGINES
 from graspd.service.model.errors import InputError, choices_text
 from graspd.service.model.fidelity import FIDELITIES, OFFERED
 from graspd.service.model.metrics import ROBUST_MODELS
@@ -147,6 +150,56 @@ def _publish(kind: str, document: dict[str, Any], data_dir: Path | None) -> str:
 
 def _echo(line: str) -> None:
     typer.echo(line, err=True)
+
+
+several = CommandGroup(help="Studies of grasps and engines.")
+app.add_typer(several, name="studies")
+
+
+@several.command(epilog="graspd studies engines --hands allegro,barrett --objects mug,bottle --out engines")
+def engines(
+    files: Annotated[list[Path] | None, typer.Argument(help="Grasp files; none: candidates are planned.")] = None,
+    names: Annotated[str, typer.Option("--engines", help="Engines, separated by commas.")] = ",".join(ENGINES),
+    hands: Annotated[str, typer.Option(help="Hand files or built-in hands, separated by commas.")] = "allegro,barrett",
+    objects: Annotated[str, typer.Option(help="Meshes or built-in objects, separated by commas.")] = "mug,bottle",
+    scenes: Annotated[str, typer.Option(help="Scenes, separated by commas.")] = "free,table",
+    grasps: Annotated[int, typer.Option("--grasps", "-n", min=1, help="Candidates per hand, object, scene.")] = 16,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the candidates.")] = 0,
+    threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder for engines.json, engines.md and the candidates.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Compare the verdicts of engines on the same grasps, at full and at half friction."""
+    from graspd.exchange.inputs import expand_path, load_case
+    from graspd.studies.engines import Found, compare_frictions, matrix_lines, plan_candidates, summarise_groups
+    from graspd.worker.validation.engines.registry import check_engines
+
+    chosen, found = check_engines(_parts(names)), Found()
+    with TemporaryDirectory() as work:
+        folder = out or Path(work)
+        folder.mkdir(parents=True, exist_ok=True)
+        listed = [one for path in files or [] for one in expand_path(path)]
+        for hand, obj, scene in product(_parts(hands), _parts(objects), _parts(scenes)) if not files else ():
+            file = folder / f"{Path(hand).stem}-{Path(obj).stem}-{Path(scene).stem}.h5"
+            _echo(file.stem)
+            try:
+                listed.append(plan_candidates(hand, obj, scene, grasps, seed, file, threads=threads))
+            except InputError as error:
+                _echo(f"{file.stem}: {error}")
+        for file in listed:
+            case = load_case(file)
+            place = file.stem.rpartition("-")[2] if not files else "free" if case.placed is None else "scene"
+            for friction, verdicts in compare_frictions(case, chosen, threads=threads).items():
+                found.setdefault((case.hand.name, place, friction), []).append(verdicts)
+    if not found:
+        raise InputError("no candidates: the hands cannot grasp these objects")
+    rows = summarise_groups(found)
+    said = [dict(zip(("hand", "scene", "friction"), key, strict=True)) | row for key, row in rows.items()]
+    lines = "\n".join(matrix_lines(rows))
+    if out is not None:
+        (out / "engines.json").write_text(dumps(said, indent=1))
+        (out / "engines.md").write_text(f"{lines}\n")
+    print_result({"rows": said}, lines, json=json)
 
 
 PEERS = ("fast_graspd", "graspit", "graspd2022", "dfc", "autograsp")

@@ -71,6 +71,8 @@ class JobView(Validated):
     stages: list[StageProgress] = []
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
     recheck_held: int = Field(0, description="rechecked grasps that held")
+    second_tested: int = Field(0, description="valid grasps that the second engine validated")
+    second_held: int = Field(0, description="those that it held")
     outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
 
     @computed_field(description="why fewer grasps than requested were found; null: not applicable")  # type: ignore[prop-decorator]

@@ -95,6 +95,8 @@ def _validation_inputs(request: JobRequest, batches: range) -> dict[str, object]
         found |= {"robust": [request.model_count, request.robust]}
     if request.measures_payload:
         found |= {"payload": [_PAYLOAD_REVISION, request.min_payload]}
+    if request.second_engines:
+        found |= {"engines": [request.second_engines, 1.0 if request.robust else request.second_engine_share]}
     if request.shake:
         found |= {"shake": True}
     return original_request(found)

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_v
 
 from graspd.service.model.base import DIGEST, Digest, Model, Name
 from graspd.service.model.contact_region import parse_cone, parse_pose, parse_region
+from graspd.service.model.engines import ENGINES
 from graspd.service.model.fidelity import AUTO, OFFERED, Fidelity, resolve_fidelity
 from graspd.service.model.grasp_types import GraspTypeName
 from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG, Density, Friction, Mass
@@ -31,6 +32,7 @@ from graspd.service.model.scene_spec import (
     has_table,
 )
 from graspd.service.model.states import AssetKind
+from graspd.service.model.version import SCHEMA_OF_ENGINES
 
 #: Grasps per batch, the unit of seeds and kernel launches.
 BATCH_SIZE: Final = 32
@@ -59,12 +61,15 @@ _LEVEL_LABELS: Final = {
 _FACE_LABELS: Final = {"drawn": "as dropped", "all": "every stable face"}
 _WANT_LABELS: Final = {"valid": "valid grasps", "candidates": "all candidates"}
 _SCENE_LABELS: Final = {"free": "free object", "table": "table", "bin": "bin", "shelf": "shelf"}
+_ENGINE_LABELS: Final = {"none": "none", "physx": "PhysX", "drake": "Drake", "all": "PhysX and Drake"}
 _TYPE_LABELS: Final = {name: name.replace("_", " ") for name in get_args(GraspTypeName)}
+NO_NEIGHBOURS: Final = "second engines simulate no neighbours: only mujoco does"
 SHAKE_NEEDS_A_SCENE: Final = "shake needs a lift out of a scene: choose a scene, such as table"
 
 
 #: Options that state requirements on grasps.
 REQUIREMENTS: Final = ("type", "digits", "touch_region", "avoid_region", "approach_cone", "like")
+SecondEngine = Literal["none", "physx", "drake", "all"]
 DigitName = Literal["thumb", "index", "middle", "ring", "little", "sixth"]
 Region = Annotated[str, Field(max_length=200), AfterValidator(lambda text: text and parse_region(text) and text)]
 Cone = Annotated[str, Field(max_length=80), AfterValidator(lambda text: text and parse_cone(text) and text)]
@@ -266,6 +271,22 @@ class JobOptions(Model):
     shake: Annotated[bool, Option(schema=5), FormField("scenes", "After the lift", "Shake: 2 cm, 3 Hz", cells=True)] = (
         _sparse_field(False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y")
     )
+    second_engine: Annotated[
+        SecondEngine,
+        Option("basic", schema=SCHEMA_OF_ENGINES),
+        FormField("grasps", "Second engine", choices=_ENGINE_LABELS, cells=True),
+    ] = _sparse_field(
+        "none",
+        description="engine besides MuJoCo that validates a share of the valid grasps: physx, drake, or all. With "
+        "`robust`, only grasps that all named engines hold count",
+    )
+    second_engine_share: Annotated[float, Option(schema=SCHEMA_OF_ENGINES)] = _sparse_field(
+        0.1,
+        gt=0,
+        le=1,
+        allow_inf_nan=False,
+        description="share of a batch's valid grasps that the second engine validates; with `robust` all",
+    )
     options: Annotated[
         dict[
             Annotated[str, Field(max_length=40)],
@@ -329,6 +350,8 @@ class JobOptions(Model):
     def _check_scene(self) -> None:
         if self.scene_spec.kind != "free" and self.method in FREE_ONLY_METHODS:
             raise ValueError(f"method {self.method} plans around free objects only: in a scene use fast_graspd")
+        if self.second_engines and self.all_neighbours:
+            raise ValueError(NO_NEIGHBOURS)
         if not self.SUBMITTED:
             return
         if self.shake and not self.in_scene:
@@ -339,6 +362,8 @@ class JobOptions(Model):
             raise ValueError(f"method {self.method} is for objects on a table: choose table, bin or a half-space")
 
     def _check_without_validation(self) -> None:
+        if self.second_engines:
+            raise ValueError("a second engine validates grasps that MuJoCo holds: choose a validator")
         if self.model_count:
             raise ValueError("robust counts verdicts: choose a validator")
         if self.measures_payload:
@@ -366,6 +391,11 @@ class JobOptions(Model):
     def model_count(self) -> int:
         """Number of perturbed models in which each valid grasp is validated; 0: only the nominal model."""
         return self.robust_models or (ROBUST_MODELS if self.robust else 0)
+
+    @property
+    def second_engines(self) -> tuple[str, ...]:
+        """Names of the engines besides MuJoCo."""
+        return tuple(one for one in ENGINES[1:] if self.second_engine in (one, "all"))
 
     @property
     def scene_spec(self) -> SceneSpec:

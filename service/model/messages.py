@@ -17,6 +17,7 @@ from pydantic import ConfigDict, Field, model_validator
 from graspd.service.model.base import Digest, Model, Name, Word
 from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import JobRequest, check_digests
+from graspd.service.model.engines import installed_engines
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.model.version import OLDEST_TASK_SCHEMA, PACKAGE_VERSION, STAGE_REVISIONS, TASK_SCHEMA
 
@@ -105,6 +106,8 @@ class WorkerHeartbeat:
     schemas: tuple[Count, Count] = (0, 0)
     """Oldest and newest schema that the worker reads; (0, 0) for graspd 0.1, whose workers get no tasks."""
     revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
+    engines: Annotated[tuple[HostWord, ...], Field(max_length=16)] = ()
+    """Installed engines of validation."""
     done: Amount = 0.0
     total: Amount = 0.0
     """Total work of the task, in the unit of `done`; 0: unknown."""
@@ -114,11 +117,11 @@ class WorkerHeartbeat:
     def of_this_process(cls, name: str, device: str, stages: Iterable[Stage]) -> Self:
         host, now, own = socket.gethostname(), timestamp(), capabilities()
         facts = (host, os.getpid(), device, "", tuple(stages), PACKAGE_VERSION, "checking", "", now, now)
-        return cls(name, *facts, schemas=own.schemas, revisions=dict(own.revisions))
+        return cls(name, *facts, schemas=own.schemas, revisions=dict(own.revisions), engines=own.engines)
 
     @property
     def capabilities(self) -> Capabilities:
-        return Capabilities(self.schemas, self.revisions)
+        return Capabilities(self.schemas, self.revisions, self.engines)
 
 
 #: First schema of messages with a range.
@@ -132,12 +135,15 @@ class Requirements:
     newest: int
     revision: int
     """Revision of the stage; 0 for ingest, which has no revision."""
+    engines: tuple[str, ...] = ()
+    """Engines besides MuJoCo."""
 
 
 @dataclass(frozen=True)
 class Capabilities:
     schemas: tuple[int, int]
     revisions: Mapping[str, int]
+    engines: tuple[str, ...] = ()
 
     def unmet_requirement(self, need: Requirements) -> str:
         """Return the first requirement that the worker does not meet, as a sentence; "" if it meets all."""
@@ -149,13 +155,18 @@ class Capabilities:
         made = self.revisions.get(need.stage.value, 0)
         if need.revision and need.revision != made:
             return f"the task needs revision {need.revision} of {need.stage.value}, but the worker has revision {made}"
+        if missing := ",".join(engine for engine in need.engines if engine not in self.engines):
+            return f"the task needs engine {missing}, which the worker lacks; run pip install 'graspd[{missing}]' there"
         return ""
 
 
 def capabilities() -> Capabilities:
-    return Capabilities((OLDEST_TASK_SCHEMA, TASK_SCHEMA), STAGE_REVISIONS)
+    return Capabilities((OLDEST_TASK_SCHEMA, TASK_SCHEMA), STAGE_REVISIONS, installed_engines())
 
 
 def requirements_of(message: TaskMessage | IngestMessage) -> Requirements:
-    revision = message.revision if isinstance(message, TaskMessage) else 0
-    return Requirements(message.stage, message.schema_, message.newest_schema or message.schema_, revision)
+    revision, engines = 0, tuple[str, ...]()
+    if isinstance(message, TaskMessage):
+        revision = message.revision
+        engines = message.request.second_engines if message.stage is Stage.SYNTHESIZE else ()
+    return Requirements(message.stage, message.schema_, message.newest_schema or message.schema_, revision, engines)

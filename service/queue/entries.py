@@ -6,14 +6,15 @@ rebuilds each job from its id and message only, and passes the message to its en
 
 There is one list per priority and stage, so that workers can serve selected stages. During an upgrade, a task that only
 some workers can do waits in a separate list. The name of this list ends in the requirements: `bulk-synthesize.2.10`
-means schema 2 and revision 10. RQ's readers modify data, so read-only code reads RQ's keys directly.
+means schema 2 and revision 10; names of engines may follow, as in `bulk-synthesize.8.33.physx`. RQ's readers modify
+data, so read-only code reads RQ's keys directly.
 """
 
 import json
 import re
 import zlib
 from collections.abc import Collection, Iterable, Mapping
-from itertools import product
+from itertools import combinations, product
 from typing import Any, Final, TypeVar, cast
 
 from pydantic import TypeAdapter, ValidationError
@@ -26,10 +27,12 @@ from rq.registry import StartedJobRegistry
 from rq.serializers import JSONSerializer
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
+from graspd.service.model.engines import ENGINES
 from graspd.service.model.errors import TaskRefused
 from graspd.service.model.messages import FIRST_SCHEMA, Capabilities, Requirements, WorkerHeartbeat, message_type
 from graspd.service.model.renamed import convert_names
 from graspd.service.model.states import Priority, Stage
+from graspd.service.model.version import SCHEMA_OF_ENGINES
 from graspd.service.queue.port import Event, Message, priority_order
 
 Entry = TypeVar("Entry", WorkerHeartbeat, Event)
@@ -135,7 +138,7 @@ RQ_WORKERS: Final[str] = Worker.redis_workers_keys
 _STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
 #: Maximum number of separate lists; further names are ignored.
 _MOST_APART: Final = 64
-_APART: Final = re.compile(r"(.+)\.([0-9]{1,4})\.([0-9]{1,4})")
+_APART: Final = re.compile(rf"(.+?)\.([0-9]{{1,4}})\.([0-9]{{1,4}})((?:\.(?:{'|'.join(ENGINES[1:])}))*)")
 _COMMON: Final = tuple(f"{priority.value}-{stage.value}" for priority, stage in product(Priority, Stage))
 _PLACES: Final = dict(zip(_COMMON, product(Priority, Stage), strict=True))
 
@@ -143,7 +146,7 @@ _PLACES: Final = dict(zip(_COMMON, product(Priority, Stage), strict=True))
 def queue_name(priority: Priority, stage: Stage, need: Requirements | None = None) -> str:
     """Return the name of the RQ queue of a priority and stage, or of a separate list for a requirement."""
     common = f"{priority.value}-{stage.value}"
-    return common if need is None else f"{common}.{need.schema}.{need.revision}"
+    return common if need is None else ".".join([common, str(need.schema), str(need.revision), *need.engines])
 
 
 def queue_names(stages: Collection[Stage], taken: int = 0, *, ability: Capabilities | None = None) -> list[str]:
@@ -193,7 +196,14 @@ def _served_requirements(stage: Stage, ability: Capabilities | None) -> list[Req
     if ability is None:
         return []
     revision = ability.revisions.get(stage.value, 0)
-    return [Requirements(stage, schema, schema, revision) for schema in range(FIRST_SCHEMA, ability.schemas[1] + 1)]
+    others = [one for one in ENGINES[1:] if one in ability.engines and stage is Stage.SYNTHESIZE]
+    # Messages with engines have at least the schema of this option.
+    sets = [chosen for size in range(len(others) + 1) for chosen in combinations(others, size)]
+    return [
+        Requirements(stage, schema, schema, revision, engines)
+        for schema in range(FIRST_SCHEMA, ability.schemas[1] + 1)
+        for engines in (sets if schema >= SCHEMA_OF_ENGINES else [()])
+    ]
 
 
 def list_key(name: str) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+from graspd.service.model.engines import ENGINES
 from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspMetric
 
@@ -66,8 +67,6 @@ PUSH_OUTCOMES: Final = dict(
 _LIFT_OUTCOMES = ("not tested", "lifted", "penetration", "contact on the approach", "lost while closing", "not lifted")
 LIFT_OUTCOMES: Final = dict(enumerate((*_LIFT_OUTCOMES, "rotated", "diverged", "neighbour moved")))
 
-#: Engines of validation, in the order of their bits in `quality/held_in`.
-ENGINES: Final = ("mujoco", "physx", "drake")
 _BITS: Final = ", ".join(f"{1 << bit} {name}" for bit, name in enumerate(ENGINES))
 
 
@@ -109,7 +108,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         ),
         "quality/held_in": _code_column(f"sum of the codes of the engines that hold the grasp: {_BITS}"),
         "quality/agreement": _optional_column(
-            "N", "f8", "1", "none", "share of the engines that give the verdict of the majority"
+            "N", "f8", "1", "none", "share of the engines that give the verdict of the majority; nan: only one"
         ),
         # Grasps planned in scenes also have the scene, the approach and the lift.
         "scene/object_pose": _optional_column("S 7", "f8", "m, 1", "scene", "object frame at rest; z points up"),

@@ -29,6 +29,13 @@ def feasible_mask(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
     return np.asarray(columns.get("quality/feasible", columns["quality/valid"])) == 1
 
 
+def second_engine_counts(columns: Mapping[str, NDArray[Any]]) -> dict[str, int]:
+    """Count valid grasps that second engines tested, and those that all engines hold."""
+    agreement = np.asarray(columns.get("quality/agreement", np.zeros(0)), float)
+    known = agreement[valid_mask(columns)] if len(agreement) else agreement
+    return {"second_tested": int(np.isfinite(known).sum()), "second_held": int((known == 1).sum())}
+
+
 def selection_mask(columns: Mapping[str, NDArray[Any]], *, unvalidated: bool = False) -> NDArray[np.bool_]:
     """Return the mask (N,) of valid grasps, or of `unvalidated` feasible grasps."""
     return feasible_mask(columns) & ~validated_mask(columns) if unvalidated else valid_mask(columns)

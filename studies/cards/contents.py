@@ -193,6 +193,7 @@ COLUMNS: Final[dict[str, tuple[str, ...]]] = {
         *(metric.path for metric in GRASP_METRICS),
         *validity.COLUMNS,
         "quality/recheck",
+        "quality/agreement",
         "quality/lift_hard",
     ),
     "scene": ("grasp/base_index", "grasp/hand_pose", "grasp/valid", "grasp/rejection", "scene/object_pose"),

@@ -34,6 +34,7 @@ def findings(card: Row) -> list[str]:
         _yield_findings,
         _balance_findings,
         _recheck_findings,
+        _second_engine_findings,
         _table_findings,
         _direction_findings,
         _joint_findings,
@@ -108,6 +109,15 @@ def _recheck_findings(card: Row) -> Iterator[str]:
             f"**Rechecks overturned {found['recheck_dropped']} of {found['rechecked']:,} verdicts** "
             f"({_percent(rate['share'])}, 95 % {_percent(rate['low'])} to {_percent(rate['high'])}): "
             f"{_join_words(wrong)}."
+        )
+
+
+def _second_engine_findings(card: Row) -> Iterator[str]:
+    found = card["validity"]
+    if rate := found["second_held"]:
+        yield (
+            f"**Second engine**: of {found['second_tested']:,} valid grasps, {_percent(rate['share'])} hold in all "
+            f"engines (95 % {_percent(rate['low'])} to {_percent(rate['high'])})."
         )
 
 

@@ -144,6 +144,8 @@ def _validity(cell: CellTally) -> Row:
         "rechecked": n["rechecked"],
         "recheck_dropped": dropped,
         "false_valid": share(dropped, n["rechecked"]),
+        "second_tested": n["second_tested"],
+        "second_held": share(n["second_held"], n["second_tested"]),
         "lift_hard": share(n["lift_hard"], n["lift_tested"]),
         "seconds": round(cell.seconds, 3),
     }

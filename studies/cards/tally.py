@@ -202,6 +202,7 @@ def _add_base(tally: Tally, cell: CellTally, piece: ShardContents, hand: AssetFa
     cell.n["candidates"] += candidates
     if validity.validated_mask(columns).any() or (not piece.rows and piece.said.get("verdict_level", "none") != "none"):
         cell.n["validated"] += candidates
+    cell.n.update(validity.second_engine_counts(columns))
     cell.rejected.update({str(why): int(count) for why, count in dict(piece.info.get("rejected", {})).items()})
     for name, tested, held in (
         ("quality/recheck", "rechecked", "recheck_held"),

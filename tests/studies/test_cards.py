@@ -144,6 +144,8 @@ def _finish(services, record: JobRecord, change: Any) -> None:
             base["quality/simulated_displacement_cm"] = rng.gamma(2.0, 0.025, task.count)
             if task.batch == 0:
                 base["quality/recheck"] = np.where(np.arange(task.count) < 8, 1, -1).astype(np.int8)
+                base["quality/agreement"] = np.full(task.count, np.nan)
+                base["quality/agreement"][:4] = [1.0, 0.5] * 2
             if change is not None:
                 change(request.hand, request.object, base)
             made = len(base["quality/valid"])
@@ -325,6 +327,8 @@ def test_counts_costs_and_clearance_are_those_of_the_dataset(kitchen: Case) -> N
     assert made["valid"] == sum(one.valid for one in base)
     assert valid["candidates"] == sum(one.candidates for one in base)
     assert (valid["rechecked"], valid["recheck_dropped"]) == (32, 0)
+    assert (valid["second_tested"], valid["second_held"]["share"]) == (16, 0.5)
+    assert "**Second engine**: of 16 valid grasps, 50 % hold in all engines" in kitchen.page
     assert sum(made["bytes"].values()) == kitchen.snapshot.size_bytes
     assert (made["scenes"], made["pictures"]) == (16, 16) and valid["rejected"]["gate"] == len(base)
     making, batches = kitchen.card["making"], 8

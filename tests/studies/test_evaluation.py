@@ -155,7 +155,14 @@ def test_engines_are_compared_and_a_copy_has_their_columns(tmp_path) -> None:
     assert shard.arrays["quality/held_in"].tolist() == held.tolist() and shard.attributes["engines"] == "mujoco"
     assert (shard.arrays["quality/agreement"] == 1).all()
     done = CliRunner().invoke(app, [str(made), "--engines", "mujoco"])
-    assert done.exit_code == 0 and re.search(rf"g +2 +{held.mean():.2f}", done.stdout), done.output
+    assert done.exit_code == 0 and f"| g | 2 | {held.mean():.3f} |" in done.stdout, done.output
+    rows = graspd("studies engines --engines mujoco --out", tmp_path / "study", made)["rows"]
+    assert [(row["friction"], row["n"]) for row in rows] == [("full", 2), ("half", 2)]
+    page = (tmp_path / "study" / "engines.md").read_text()
+    assert rows[0]["success"] == found["success"] and "| free | full | 2 |" in page
+    words = "studies engines --engines mujoco --hands barrett --objects block --scenes table -n 1 --out"
+    rows = graspd(words, tmp_path / "planned")["rows"]
+    assert [(row["hand"], row["scene"], row["n"]) for row in rows] == [("barrett", "table", 1)] * 2
 
 
 @pytest.mark.parametrize(

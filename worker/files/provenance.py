@@ -329,6 +329,8 @@ def base_attributes(
         said["requirements"] = json_attribute(request.requirements)
     if request.model_count:
         said["robust"] = json_attribute({"models": request.model_count, "wanted": request.robust})
+    if request.second_engines:
+        said["engines"] = ",".join(("mujoco", *request.second_engines))
     if verdict_key is None:
         return said | {"verdict_level": "none"}
     return said | {"verdict_level": request.validation, "verdict_key": verdict_key}

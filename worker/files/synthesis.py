@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOptions
+from graspd.service.model.domain import BATCH_SIZE, NO_NEIGHBOURS, SHAKE_NEEDS_A_SCENE, JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.local_options import GRASP_FILE, LocalOptions
 from graspd.service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
@@ -45,6 +45,7 @@ from graspd.worker.planners.registry import local_options
 from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.scenes.rest import count_rolling_poses
+from graspd.worker.validation.engines.registry import check_engines
 from graspd.worker.validation.payload import PayloadLimit
 
 Arrays = dict[str, NDArray[Any]]
@@ -133,6 +134,8 @@ class SynthesisResult:
                 "robust_share": self._mean("robust_share", 4),
                 "not_robust": sum(batch.rejected.get("not_robust", 0) for batch in self.batches),
             }
+        if request.second_engines:
+            summary["second_engines"] = {"names": request.second_engines, **validity.second_engine_counts(self.arrays)}
         if self.place.kind != "free":
             summary |= {"scene": self.place.kind, "scenes": len(self.arrays["scene/object_pose"])} | self._shares()
             summary |= {"rolling_scenes": self.rolling, "narrow": self.narrow_reason}
@@ -221,6 +224,9 @@ def synthesize_grasps(
     `processes` validate and measure: 1 is this process alone, 0 stands for `pool_process_count`. Raises InputError: an
     invalid argument, or a scene without space. TaskCancelled: cancelled; with `partial`, only before any validation."""
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
+    check_engines(request.second_engines)
+    if request.second_engines and place.neighbours:
+        raise InputError(NO_NEIGHBOURS)
     if request.shake and place.kind == "free":
         raise InputError(SHAKE_NEEDS_A_SCENE)
     options = dict(mesh or {})

@@ -14,6 +14,7 @@ from graspd.service.model.messages import TaskMessage
 from graspd.service.model.planning import format_outcomes, sum_outcomes
 from graspd.service.model.states import Stage
 from graspd.service.store.columns import Attribute
+from graspd.service.store.validity import second_engine_counts
 from graspd.worker.batched_generation import validated_batches
 from graspd.worker.files.provenance import base_attributes
 from graspd.worker.generation import ValidatedBatch
@@ -58,6 +59,8 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             raise SceneError(str(error)) from None
         raise
     made = [_create_output(one, part) for one, part in zip(found, columns or [{}] * len(found), strict=True)]
+    if message.request.second_engines:
+        made = [replace(one, info={**one.info, "second_engine": second_engine_counts(one.arrays)}) for one in made]
     attributes = base_attributes(
         hand,
         obj,

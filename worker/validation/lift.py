@@ -202,11 +202,11 @@ class Lift(Test):
 
     def _complete_result(self, rollout: LiftResult, outcome: Outcome) -> LiftResult:
         rollout.steps, rollout.margin = self._steps, self._motion_excess()
-        rollout.outcome = _OUTCOMES[outcome]
+        rollout.outcome = OUTCOMES[outcome]
         return rollout
 
 
-_OUTCOMES: Final[dict[Any, LiftOutcome]] = {
+OUTCOMES: Final[dict[Any, LiftOutcome]] = {
     Outcome.HELD: LiftOutcome.LIFTED,
     Outcome.DISPLACED: LiftOutcome.NOT_LIFTED,
     Outcome.ROTATED: LiftOutcome.TURNED,

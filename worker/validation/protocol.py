@@ -9,7 +9,7 @@ fast: coarser physics (fixed root, 6 ms). Where the margin is not clear, level s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Final
@@ -81,6 +81,16 @@ class Rollout:
     def fail(self, outcome: Outcome, direction: int = 0) -> Rollout:
         self.outcomes[direction] = outcome
         return self
+
+
+def loss_text(outcomes: Iterable[int]) -> str:
+    """Return `held`, or the first failure and the direction of its push."""
+    axes = ("+x", "-x", "+y", "-y", "+z", "-z")
+    for axis, outcome in zip(axes, map(Outcome, outcomes), strict=False):
+        if outcome not in (Outcome.HELD, Outcome.NOT_TRIED):
+            name = outcome.name.lower().replace("_", " ")
+            return f"{name} under {axis}" if outcome in (Outcome.DISPLACED, Outcome.ROTATED) else name
+    return "held"
 
 
 class Test:

@@ -22,7 +22,7 @@ from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import Level, postures_key, verdict_key
 from graspd.worker.validation.model import COARSE, MujocoOptions, Scene, scene_of
 from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, prefilter_key_terms, run_prefilter
-from graspd.worker.validation.protocol import DIRECTIONS, FAST_BAND, Outcome, Rollout, Test
+from graspd.worker.validation.protocol import DIRECTIONS, FAST_BAND, Outcome, Rollout, Test, loss_text
 
 log = logging.getLogger(__name__)
 _CHUNK: Final = 2  # grasps per task of a process pool: few, so that many processes share one batch
@@ -57,14 +57,7 @@ class Verdicts:
     @property
     def reasons(self) -> list[str]:
         """`held` per grasp, or the first failure and its direction."""
-        axes = ("+x", "-x", "+y", "-y", "+z", "-z")
-        found: list[str] = []
-        for row in self.outcome:
-            bad = [k for k, value in enumerate(row) if value not in (Outcome.HELD, Outcome.NOT_TRIED)]
-            name = Outcome(int(row[bad[0]])).name.lower().replace("_", " ") if bad else "held"
-            pushed = bad and row[bad[0]] in (Outcome.DISPLACED, Outcome.ROTATED)
-            found.append(f"{name} under {axes[bad[0]]}" if pushed else name)
-        return found
+        return [loss_text(row) for row in self.outcome.tolist()]
 
 
 def validate(

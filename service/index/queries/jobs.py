@@ -45,9 +45,12 @@ class Jobs(database.IndexPart):
         with self.database.read_transaction() as connection:
             query = select(jobs).where(jobs.c.id == job_id, *database.scope_conditions(scope, jobs))
             (view,) = _job_views(connection, [self.database.first_row(query, f"job {job_id!r}", connection)])
-            if view.note is None:
-                return view
-            return view.model_copy(update={"outcomes": outcomes_of(connection, tasks.c.job_id == job_id)})
+            more: dict[str, Any] = {}
+            if view.request.second_engines:
+                more = outcomes_of(connection, tasks.c.job_id == job_id, "second_engine")
+            if view.note is not None:
+                more["outcomes"] = outcomes_of(connection, tasks.c.job_id == job_id)
+            return view.model_copy(update=more)
 
     def unfinished(self, ids: Collection[str]) -> set[str]:
         query = select(jobs.c.id).where(jobs.c.finished.is_(None))
@@ -138,9 +141,9 @@ def _task_view(row: Any) -> TaskView:
 MOST_SHARDS: Final = 1000
 
 
-def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[str, int]:
-    """Count rejected candidates by outcome in at most `MOST_SHARDS` shards of the selected jobs."""
-    query = select(shards.c.manifest["info"]["outcomes"]).join(tasks, tasks.c.shard_id == shards.c.id)
+def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool], name: str = "outcomes") -> dict[str, int]:
+    """Sum counts in at most `MOST_SHARDS` shards of the selected jobs: rejected candidates by outcome, or others."""
+    query = select(shards.c.manifest["info"][name]).join(tasks, tasks.c.shard_id == shards.c.id)
     query = query.where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value).limit(MOST_SHARDS)
     return sum_outcomes(one for one in connection.scalars(query) if isinstance(one, dict))
 

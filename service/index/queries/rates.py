@@ -216,6 +216,7 @@ def cost_options(options: JobOptions) -> Hashable:
         options.want,
         options.validation,
         (options.model_count, options.robust),
+        (options.second_engine, options.second_engine_share),
         options.scene_spec.kind,
         len(options.all_neighbours),
     )

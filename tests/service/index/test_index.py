@@ -83,6 +83,14 @@ def test_a_job_that_found_fewer_grasps_tells_the_outcomes(services: Services) ->
     assert listed.note is not None and not listed.outcomes
 
 
+def test_verdicts_of_a_second_engine_are_counted(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=64, second_engine="physx"))
+    for task in plan_tasks(record := record_of(services, job.id)):
+        make_task(services, record, task, second_engine={"second_tested": 4, "second_held": 3})
+    done = services.index.jobs.get(job.id)
+    assert (done.second_tested, done.second_held) == (8, 6)
+
+
 def test_jobs_are_chosen_by_id_state_hand_and_object(services: Services) -> None:
     job, _ = job_actions.submit(services, request())
     found = services.index.jobs.page(state=State.QUEUED, hand="gripper", object="ball", prefix=job.id[:4]).items

@@ -30,18 +30,23 @@ from graspd.service.store.manifests import ShardManifest
 from tests.fakes import OBJECT_FILES, beat_of, make_shard, message_for, plan_all, put_asset, request, with_settings
 from tests.service.pipeline.test_controller import Bench
 
-OWN = capabilities()
+OWN = replace(capabilities(), engines=("drake",))
 REVISION = OWN.revisions["synthesize"]
 NEED = Requirements(Stage.SYNTHESIZE, OWN.schemas[0], OWN.schemas[1], REVISION)
 
 
 def beat(
-    schemas: tuple[int, int] = OWN.schemas, revision: int = REVISION, stage: Stage = NEED.stage
+    schemas: tuple[int, int] = OWN.schemas,
+    revision: int = REVISION,
+    stage: Stage = NEED.stage,
+    engines: tuple[str, ...] = (),
 ) -> WorkerHeartbeat:
-    return beat_of(stages=(stage,), schemas=schemas, revisions={**OWN.revisions, "synthesize": revision})
+    revisions = {**OWN.revisions, "synthesize": revision}
+    return beat_of(stages=(stage,), schemas=schemas, revisions=revisions, engines=engines)
 
 
 NEXT = beat(revision=REVISION + 1)
+PHYSX = replace(NEED, engines=("physx",))
 
 
 @pytest.mark.parametrize(
@@ -54,6 +59,8 @@ NEXT = beat(revision=REVISION + 1)
         ([beat(), beat(schemas=(9, 9))], NEED, Route(apart=True)),
         ([beat(schemas=(2, 9)), beat(schemas=(2, 2))], replace(NEED, schema=3, newest=9), Route(apart=True)),
         ([beat(schemas=(4, 9))], replace(NEED, schema=2, newest=5), Route()),
+        ([beat(engines=("physx",)), beat(engines=("drake", "physx"))], PHYSX, Route()),
+        ([beat(engines=("physx",)), beat()], PHYSX, Route(apart=True)),
     ],
 )
 def test_a_task_goes_where_able_workers_look(present: list[WorkerHeartbeat], need: Requirements, place: Route) -> None:
@@ -67,6 +74,7 @@ def test_a_task_goes_where_able_workers_look(present: list[WorkerHeartbeat], nee
         ([], replace(NEED, revision=1), "needs revision 1 of synthesize"),
         ([beat(schemas=(2, 2))], replace(NEED, schema=3, newest=3), "schema 3, but the worker reads at most schema 2"),
         ([beat(schemas=(5, 6))], replace(NEED, newest=4), "has at most schema 4"),
+        ([beat(engines=("drake",))], PHYSX, "engine physx, which the worker lacks; run pip install 'graspd[physx]'"),
     ],
 )
 def test_what_nobody_can_do_is_held_with_the_reason(
@@ -95,20 +103,22 @@ def test_a_worker_that_does_not_say_what_it_can_is_given_no_task() -> None:
 def test_a_worker_looks_apart_only_for_what_it_can_do() -> None:
     names = queue_names([Stage.SYNTHESIZE], ability=OWN)
     apart = [f"interactive-synthesize.{schema}.{REVISION}" for schema in range(FIRST_SCHEMA, OWN.schemas[1] + 1)]
-    assert names[: len(apart) + 1] == [*apart, "interactive-synthesize"]
+    # Only messages of the newest schema name engines.
+    assert names[: len(apart) + 2] == [*apart, f"{apart[-1]}.drake", "interactive-synthesize"]
 
 
 def test_tasks_that_wait_apart_are_seen_and_leave(rq_queue: RqQueue) -> None:
-    message = message_for()
-    name = f"rq:queue:{queue_name(Priority.BULK, Stage.SYNTHESIZE, NEED)}"
+    message = message_for(second_engine="drake")
+    need = replace(NEED, schema=message.schema_, engines=("drake",))
+    name = f"rq:queue:{queue_name(Priority.BULK, Stage.SYNTHESIZE, need)}"
     assert rq_queue.enqueue([message], Priority.BULK, apart=True) == 1
     assert rq_queue.connection.llen(name) == 1
     assert rq_queue.waiting_tasks() == {message.task_id}
     assert rq_queue.depths()[Priority.BULK, Stage.SYNTHESIZE] == 1
     assert rq_queue.status(lease_s=6).depth[Priority.BULK, Stage.SYNTHESIZE] == 1
-    rq_queue.remove_unserved_lists([beat(), NEXT])
+    rq_queue.remove_unserved_lists([beat(engines=("drake",)), NEXT])
     assert rq_queue.waiting_tasks() == {message.task_id}
-    rq_queue.remove_unserved_lists([NEXT])
+    rq_queue.remove_unserved_lists([beat(), NEXT])
     assert rq_queue.waiting_tasks() == set()
     assert list_names(rq_queue.connection) == list_names(rq_queue.connection)[:8]
     assert rq_queue.enqueue([message], Priority.BULK) == 1, "nothing of it is left"

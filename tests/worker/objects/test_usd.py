@@ -13,7 +13,7 @@ import pytest
 
 from graspd.service.model.errors import MeshError
 from graspd.worker.objects.check import check_object
-from graspd.worker.objects.formats import read_mesh
+from graspd.worker.objects.formats import read_mesh, usd
 from graspd.worker.objects.mesh_geometry import signed_volume
 from graspd.worker.objects.prepare import files_from_path, load_object
 
@@ -54,6 +54,10 @@ def test_frame_is_the_stages_in_metres() -> None:
     soup = read_mesh("thing.usda", thing(f'def Mesh "m" {{ {inner} }}'))
     assert np.allclose(soup.vertices.min(axis=0), [0, 0.2, 0])
     assert np.allclose(soup.vertices.max(axis=0), [0.01, 0.21, 0.01])
+    # Stages are kept within a limit of bytes, and by digests instead of their files.
+    kept = usd._read_packed.cache
+    assert 0 < kept.currsize <= kept.maxsize == usd._KEPT_BYTES
+    assert all(len(key[0]) == 32 and isinstance(key[0], str) for key in kept)
 
 
 @pytest.mark.parametrize(

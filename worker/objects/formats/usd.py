@@ -9,13 +9,15 @@ import tempfile
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from threading import Lock
 from typing import Any, Final
 
 import numpy as np
+from cachetools import LRUCache, cached
 from numpy.typing import NDArray
 
+from graspd.service.model.digests import digest_bytes
 from graspd.service.model.errors import InputError, MeshError
 from graspd.service.model.matter import MOST_FRICTION
 from graspd.service.model.transforms import Floats
@@ -30,6 +32,8 @@ from graspd.worker.objects.isolation import run_isolated
 MAGIC: Final = (b"#usda", b"PXR-USDC", b"PK\x03\x04")
 #: Largest size of all layers together [bytes].
 _MAX_BYTES: Final = 2**28
+#: Size of the arrays of all stages that are kept for repeated loading [bytes]; larger stages are read again.
+_KEPT_BYTES: Final = 2**25
 Ints = NDArray[np.int64]
 
 
@@ -116,9 +120,13 @@ def read_stage(files: Mapping[str, bytes], main: str, error: type[InputError]) -
         raise error(str(refused)) from None
 
 
-@lru_cache(maxsize=2)
+@cached(
+    LRUCache[tuple[str, str], Stage](_KEPT_BYTES, lambda stage: 1 + sum(one.nbytes for one in stage.arrays.values())),
+    key=lambda packed, main: (digest_bytes(packed), main),
+    lock=Lock(),
+)
 def _read_packed(packed: bytes, main: str) -> Stage:
-    """Read a stage from a ZIP of its layers; the last ones are kept for repeated loading."""
+    """Read a stage from a ZIP of its layers; the last small ones are kept for repeated loading."""
     with tempfile.TemporaryDirectory(prefix="graspd-usd-") as folder:
         for name, data in unpack(packed, limit_bytes=2 * _MAX_BYTES).items():
             file = Path(folder) / name

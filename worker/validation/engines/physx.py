@@ -64,7 +64,7 @@ class PhysxSimulation:
     """One scene of PhysX with a hand and an object."""
 
     def __init__(self, model: EngineModel) -> None:
-        self._model = model
+        self._model, self._fresh = model, True
         self._build()
         names = [joint.name for joint in self._hand.active_joints]
         self._rails = [names.index(axis) for axis in _RAILS]
@@ -99,7 +99,9 @@ class PhysxSimulation:
             self._add_support(support)
 
     def reset(self, object_pose: Floats, root: Floats, joints: Floats) -> None:
-        self._build()  # else contacts of the last trial remain in PhysX's caches, and verdicts depend on the order
+        if not self._fresh:
+            self._build()  # else contacts of the last trial remain in PhysX's caches, and verdicts depend on the order
+        self._fresh = False
         self._object.entity.pose = _pose(object_pose)
         self._object.linear_velocity = self._object.angular_velocity = np.zeros(3)
         self._base = np.array(root, float)

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.service.model.engines import ENGINES
 from graspd.service.model.errors import InputError, choices_text
 from graspd.service.model.transforms import Floats
-from graspd.service.store.columns import ENGINES
 from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext, evaluate_rows
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
@@ -22,10 +22,10 @@ from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.engines.port import Engine, Simulation
 from graspd.worker.validation.engines.trial import engine_model, run_trial, trial_of
-from graspd.worker.validation.lift import Lift, LiftOutcome
+from graspd.worker.validation.lift import OUTCOMES, Lift, LiftOutcome
 from graspd.worker.validation.lifting import require_approaches, validate_lifts
 from graspd.worker.validation.model import MujocoOptions, scene_of
-from graspd.worker.validation.protocol import Outcome, Rollout, Test
+from graspd.worker.validation.protocol import Outcome, Rollout, Test, loss_text
 from graspd.worker.validation.validator import validate
 
 
@@ -35,7 +35,7 @@ class EngineVerdicts:
 
     engine: str
     success: NDArray[np.int8]  # (N,) 1 held, 0 not
-    reasons: tuple[str, ...]  # (N,) `held`, or the kind of the loss
+    reasons: tuple[str, ...]  # (N,) `held` or `lifted`, or the kind of the loss
     margin: Floats  # (N,) largest ratio of displacement or rotation to its limit
     core_s: float  # CPU time of this process
 
@@ -104,10 +104,10 @@ def validate_with_engine(
             rollout = run_trial(
                 simulation, trial_of(scene, grasps, row, placed), obj.centre_of_mass, early=level != "dexgraspbench"
             )
-            lost = [outcome for outcome in rollout.outcomes if outcome not in (Outcome.HELD, Outcome.NOT_TRIED)]
-            reason = lost[0].name.lower().replace("_", " ") if lost else "held"
+            lifted = OUTCOMES.get(rollout.outcomes[0], rollout.outcomes[0])
+            reason = loss_text(rollout.outcomes) if placed is None else lifted.name.lower().replace("_", " ")
         done_rows.add(1)
-        return reason == "held", reason, rollout.margin
+        return rollout.success, reason, rollout.margin
 
     rows = evaluate_rows(range(len(grasps)), tests, ask, threads=run.cores, name=name)
     held, reasons, margin = zip(*rows, strict=True) if rows else ((), (), ())

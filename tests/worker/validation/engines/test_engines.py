@@ -5,9 +5,14 @@ import sys
 import numpy as np
 import pytest
 
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.engines import ENGINES
 from graspd.service.model.errors import InputError
+from graspd.service.store.validity import second_engine_counts
 from graspd.studies.engines import summarise
+from graspd.worker import generation
 from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.generation import score_grasps
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.validation.engines import registry
@@ -87,3 +92,52 @@ def test_an_engine_that_is_not_there_is_named_with_its_extra(monkeypatch: pytest
         check_engines(["physx"])
     with pytest.raises(InputError, match="unknown engine 'havok'"):
         check_engines(["mujoco", "havok"])
+
+
+def firm_and_loose() -> GraspSet:
+    """Grasps 0, 2 and 4 pinch the middle of a box; grasps 1, 3 and 5 do not squeeze it."""
+    contact, open_hand, firm, loose = (((0, 0, 0), (at, at)) for at in (0.065, 0.055, 0.115, 0.065))
+    return GraspSet(posture(*[contact] * 6), posture(*[open_hand] * 6), posture(*[firm, loose] * 3), np.full(6, np.nan))
+
+
+@pytest.mark.parametrize("engine", ENGINES[1:], indirect=True)
+def test_a_second_engine_validates_a_share_of_the_grasps_that_mujoco_holds(engine: str) -> None:
+    request = JobOptions(grasps=6, second_engine=engine, second_engine_share=0.5)
+    found = score_grasps(
+        PADS, BOX, firm_and_loose(), request, pieces=lambda obj: WHOLE, run=ExecutionContext(threads=1)
+    ).columns
+    assert found["quality/success"].tolist() == [1, 0] * 3 and found["quality/valid"].tolist() == [1, 0] * 3
+    # Half of three valid grasps, rounded up and evenly spaced.
+    both = 1 + (1 << ENGINES.index(engine))
+    assert found["quality/held_in"].tolist() == [both, 0, both, 0, 1, 0]
+    np.testing.assert_array_equal(found["quality/agreement"], [1, np.nan, 1, np.nan, np.nan, np.nan])
+    assert second_engine_counts(found) == {"second_tested": 2, "second_held": 2}
+
+
+def test_robust_grasps_hold_in_all_engines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in drops every other grasp that it receives: only the others count."""
+
+    def validate_every_other(name: str, hand: HandModel, obj: object, grasps: GraspSet, *_: object, **__: object):
+        held = (np.arange(len(grasps)) % 2 == 0).astype(np.int8)
+        return EngineVerdicts(name, held, (), np.zeros(len(grasps)), 0.0)
+
+    monkeypatch.setattr(generation, "check_engines", tuple)
+    monkeypatch.setattr(generation, "validate_with_engine", validate_every_other)
+    request = JobOptions(grasps=6, second_engine="all", robust=0.5, robust_models=1)
+    scoring = {"scenes": None, "pieces": lambda obj: WHOLE, "run": ExecutionContext(threads=1)}
+    with generation.Scoring(PADS, BOX, request, **scoring) as work:
+        made = work.evaluate(firm_and_loose(), ExecutionContext(threads=1))
+    assert made.fates.tolist() == ["kept", "turned", "not_robust", "turned", "kept", "turned"]
+    assert made.columns["quality/held_in"].tolist() == [7, 7]
+
+
+def test_the_first_trial_uses_the_scene_that_was_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sapien", reason="extra physx")
+    from graspd.worker.validation.engines.physx import PhysxSimulation
+
+    built = list[PhysxSimulation]()
+    build = PhysxSimulation._build
+    monkeypatch.setattr(PhysxSimulation, "_build", lambda self: (built.append(self), build(self))[1])
+    grasps, run = firm_and_loose().take([0, 0, 0]), ExecutionContext(threads=1)
+    found = validate_with_engine("physx", PADS, BOX, grasps, pieces=WHOLE, run=run)
+    assert len(built) == 3 and len(set(found.margin)) == 1
