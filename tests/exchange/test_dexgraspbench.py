@@ -12,19 +12,22 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
+import yourdfpy
 from scipy.spatial.transform import Rotation, Slerp
 
 from graspd.exchange import dexgraspbench
-from graspd.exchange.bench_hand import body_names
+from graspd.exchange.bench_hand import benchmark_mapping, body_names
 from graspd.exchange.bench_scene import check_table
 from graspd.service.model.errors import InputError
-from graspd.service.model.transforms import invert, quat_to_matrix
+from graspd.service.model.transforms import compose, invert, pose_from_matrix, quat_to_matrix
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from tests.worker.commands_run import graspd
+from tests.worker.hands.urdfs import joint, link, robot
+from tests.worker.hands.urdfs import load as load_urdf
 
 PREFIX = "child-"
 #: Rounding of a pose in float64 through text of 12 digits [m].
@@ -51,6 +54,27 @@ _SHADOW_THUMB = [
     ([0.034, -0.00858, 0.029], [0.92388, 0, 0.382683, 0], [0, 0, -1]), ([0, 0, 0], [1, 0, 0, 0], [1, 0, 0]),
     ([0, 0, 0.038], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0], [1, 0, 0, 0], [0, -1, 0]),
     ([0, 0, 0.032], [1, 0, 0, -1], [1, 0, 0]),
+]  # fmt: skip
+#: And of its LEAP hand: palm turned by 0 1 0 0, 100 mm above the world's origin; 0.500003 stands for half a right angle.
+_LEAP_FINGER = [
+    ([-0.007, 0.023, -0.0187], [0.500003, 0.5, 0.5, -0.499997], [0, 0, -1]),
+    ([-0.0122, 0.0381, 0.0145], [0.500003, -0.5, -0.499997, 0.5], [0, 0, -1]),
+    ([0.015, 0.0143, -0.013], [0.500003, 0.5, -0.5, 0.499997], [0, 0, -1]), ([0, -0.0361, 0.0002], [1, 0, 0, 0], [0, 0, -1]),
+]  # fmt: skip
+_LEAP_THUMB = [
+    ([-0.0693, -0.0012, -0.0216], [0.707109, 0, 0.707105, 0], [0, 0, -1]),
+    ([0, 0.0143, -0.013], [0.500003, 0.5, -0.5, 0.499997], [0, 0, -1]),
+    ([0, 0.0145, -0.017], [0.707109, -0.707105, 0, 0], [0, 0, -1]), ([0, 0.0466, 0.0002], [0, 0, 0, 1], [0, 0, -1]),
+]  # fmt: skip
+#: Origins of the vendor's URDF: position, roll pitch yaw. Bases of index, middle and ring finger; finger; thumb.
+_LEAP_BASES = ["-0.007 0.023 -0.0187", "-0.0071 -0.0224 -0.0187", "-0.00709 -0.0678 -0.0187"]
+_LEAP_LINKS = [
+    ("", "1.57079 1.57079 0"), ("-0.0122 0.0381 0.0145", "-1.57079 0 1.57079"),
+    ("0.015 0.0143 -0.013", "1.57079 -1.57079 0"), ("0 -0.0361 0.0002", "0 0 0"),
+]  # fmt: skip
+_LEAP_THUMB_LINKS = [
+    ("-0.0693 -0.0012 -0.0216", "0 1.57079 0"), ("0 0.0143 -0.013", "1.57079 -1.57079 0"),
+    ("0 0.0145 -0.017", "-1.57079 0 0"), ("0 0.0466 0.0002", "0 0 3.14159"),
 ]  # fmt: skip
 
 
@@ -290,6 +314,48 @@ def test_benchmarks_hand_is_mapped_to_its_model(shared_data, block, tmp_path, co
     mapping = json.loads((npy.parents[3] / "hand_mapping.json").read_text())
     assert mapping["root_link"] == hand.root_link and mapping["config"] == config
     assert [ours for _, ours in mapping["joints"]][first + len(chain) - 1] == tip
+
+
+def leap_urdf(base: bool, mirrored: bool) -> bytes:
+    """The vendor's right hand, with small boxes for links; mirrored, the first joint is elsewhere."""
+    parts = [link("palm_lower")]
+    if base:
+        turned = '0 0.038 0.098" rpy="0 -1.57079 0'
+        parts = [link("base"), *parts, joint("base_joint", "base", "palm_lower", kind="fixed", origin=turned)]
+    for number in range(4):
+        links = _LEAP_THUMB_LINKS if number == 3 else [(_LEAP_BASES[number], _LEAP_LINKS[0][1]), *_LEAP_LINKS[1:]]
+        names = [4 * number + k for k in ((0, 1, 2, 3) if number == 3 else (1, 0, 2, 3))]
+        above = "palm_lower"
+        for name, (xyz, rpy) in zip(names, links, strict=True):
+            place = (xyz.replace("-", "") if mirrored else xyz) + f'" rpy="{rpy}'
+            parts += [link(f"link_{name}"), joint(str(name), above, f"link_{name}", origin=place, axis="0 0 -1")]
+            above = f"link_{name}"
+    return robot(*parts)
+
+
+@pytest.mark.parametrize("base", [False, True])
+def test_leap_is_mapped_to_the_benchmarks_model_and_back(base: bool, tmp_path: Path) -> None:
+    hand = load_urdf(leap_urdf(base, mirrored=False))
+    mapping = benchmark_mapping(hand)
+    assert mapping is not None and mapping.config == "leap"
+    assert [ours for _, ours in mapping.joints] == "1 0 2 3 5 4 6 7 9 8 10 11 12 13 14 15".split()
+    (tmp_path / "leap.urdf").write_bytes(leap_urdf(base, mirrored=False))
+    oracle = yourdfpy.URDF.load(str(tmp_path / "leap.urdf"), load_meshes=False, build_scene_graph=True)
+    posture = random_postures(hand).grasp
+    root, joints = posture.hand_pose[0], posture.joint_positions[0]
+    qpos = mapping.qpos(hand, root, joints)
+    oracle.update_cfg(dict(zip(hand.joint_names, joints, strict=True)))
+    for chain, first, tip in ((_LEAP_FINGER, 0, "link_3"), (_LEAP_THUMB, 12, "link_15")):
+        model = mujoco.MjModel.from_xml_string(_chain([0, 0, 0.1, 0, 1, 0, 0], chain))
+        data = mujoco.MjData(model)
+        data.qpos[:] = [*qpos[:7], *qpos[7 + first : 11 + first]]
+        mujoco.mj_kinematics(model, data)
+        there = compose(root, pose_from_matrix(oracle.get_transform(tip, hand.root_link)))
+        np.testing.assert_allclose(data.xpos[-1], there[:3], atol=2e-5)  # the files' quaternions have six digits
+    back = mapping.posture(hand, qpos[None])
+    np.testing.assert_allclose(back[0][0], root, atol=1e-12)
+    np.testing.assert_array_equal(back[1][0], joints)
+    assert benchmark_mapping(load_urdf(leap_urdf(base, mirrored=True))) is None, "a left hand is another model"
 
 
 def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block, tmp_path: Path) -> None:
