@@ -20,7 +20,7 @@ from graspd.service.store.shards import read_shard
 from graspd.service.store.store import open_store
 from graspd.service.store.usd_layers import import_usd
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, select_grasps
+from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, open_source
 
 app = CommandGroup(no_args_is_help=True)
 
@@ -36,7 +36,9 @@ IMPORTS: Final = (
 
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
 def export(
-    source: Annotated[Path, typer.Argument(help="Shard; for webdataset and training formats a folder of shards.")],
+    source: Annotated[
+        str, typer.Argument(help="Shard; for dexgraspbench, webdataset and training a folder or dataset, too.")
+    ],
     format_: Annotated[str, typer.Option("--format", help=", ".join(EXPORTS) + ".")] = "images",
     hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
     object_: Annotated[str | None, typer.Option("--object", help="Object file; default: found by its digest.")] = None,
@@ -54,7 +56,8 @@ def export(
         str | None, typer.Option(help="Pose of the arm's base in the scene or object frame: x y z qw qx qy qz.")
     ] = None,
     mount_pose: Annotated[str | None, typer.Option(help="Pose of the hand in the mount: x y z qw qx qy qz.")] = None,
-    held_out: Annotated[float, typer.Option(help="For training: share of held-out objects.")] = 0.2,
+    held_out: Annotated[float, typer.Option(help="For training and splits: share of held-out objects.")] = 0.2,
+    split: Annotated[str, typer.Option(help="For dexgraspbench: only one split, train or test; default: all.")] = "",
     noise: Annotated[str, typer.Option(help="For training: noise of depth, stereo or structured_light.")] = "",
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("export"),
     json: JsonFlag = False,
@@ -64,24 +67,27 @@ def export(
         raise InputError(f"there is no export format {format_!r}; choose one of {choices_text(format_, EXPORTS)}")
     if depth not in ("exr", "png"):
         raise InputError(f"there is no depth format {depth!r}; use exr or png")
+    if split not in ("", "train", "test"):
+        raise InputError(f"there is no split {split!r}; use train or test")
     with check_written_files(output):
         if format_ in ROBOTS:
             from graspd.exchange.robot_export import RobotExportOptions, export_grasps
 
             of_robot = (best, tool, speed, arm, mount, base, mount_pose)
             robot = RobotExportOptions(hand, object_, unvalidated, every, *of_robot)
-            done = export_grasps(source, format_, robot, output)
-        elif format_ in TRAINING:
-            from graspd.exchange.training_export import TrainingExportOptions, export_training
+            done = export_grasps(Path(source), format_, robot, output)
+        elif format_ in (*TRAINING, "dexgraspbench"):
+            from graspd.exchange.training_export import TrainingExportOptions, export_bench, export_training
 
             training = TrainingExportOptions(hand, object_, unvalidated, every, held_out, noise)
-            done = export_training(source, format_, training, output)
+            if format_ == "dexgraspbench":
+                done = export_bench(source, training, split, output)
+            else:
+                done = export_training(source, format_, training, output)
         elif format_ == "webdataset":
             done = _export_webdataset(source, output, unvalidated=unvalidated, every=every)
-        elif format_ == "dexgraspbench":
-            done = _export_dexgraspbench(source, hand, object_, output, unvalidated=unvalidated, every=every)
         else:
-            done = _export_pictures(source, format_, depth, output)
+            done = _export_pictures(Path(source), format_, depth, output)
     told = {"folder": str(output), "format": format_, **done.counts, **({"notes": done.notes} if done.notes else {})}
     line = f"{output}: " + ", ".join(f"{n} {what}" for what, n in done.counts.items() if isinstance(n, int))
     print_result(told, line, json=json)
@@ -177,26 +183,13 @@ def _export_pictures(source: Path, format_: str, depth: str, output: Path) -> Ex
     return ExportSummary({"pictures": len(views["camera/eye"]), "files": len(written)})
 
 
-def _export_webdataset(source: Path, output: Path, *, unvalidated: bool, every: bool) -> ExportSummary:
+def _export_webdataset(source: str, output: Path, *, unvalidated: bool, every: bool) -> ExportSummary:
     from graspd.exchange import webdataset
-    from graspd.service.readers import Pictures, open_shards
+    from graspd.service.readers import Pictures
 
-    shards = open_shards(source)
+    shards = open_source(source)
     written = webdataset.write(shards, output, valid=not every, unvalidated=unvalidated)
     return ExportSummary({"pictures": len(Pictures(shards)), "files": len(written)})
-
-
-def _export_dexgraspbench(
-    source: Path, hand: str | None, obj: str | None, output: Path, *, unvalidated: bool, every: bool
-) -> ExportSummary:
-    from graspd.exchange import dexgraspbench
-    from graspd.exchange.inputs import load_case
-
-    case = load_case(source, hand=hand, obj=obj)
-    mask, _ = select_grasps(read_shard(source, kind="base"), unvalidated=unvalidated, every=every)
-    rows = np.flatnonzero(mask)
-    written = dexgraspbench.write(case.hand, case.obj, case.grasps, rows.tolist(), output, case.placed)
-    return ExportSummary({"grasps": len(written), "files": len(written)})
 
 
 def _summary(file: Path) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
-from tests.worker.commands_run import graspd
+from tests.worker.commands_run import graspd, refused
 from tests.worker.hands.urdfs import joint, link, robot
 from tests.worker.hands.urdfs import load as load_urdf
 
@@ -55,11 +55,12 @@ _SHADOW_THUMB = [
     ([0, 0, 0.038], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0], [1, 0, 0, 0], [0, -1, 0]),
     ([0, 0, 0.032], [1, 0, 0, -1], [1, 0, 0]),
 ]  # fmt: skip
-#: And of its LEAP hand: palm turned by 0 1 0 0, 100 mm above the world's origin; 0.500003 stands for half a right angle.
+#: And of its LEAP hand: palm turned by 0 1 0 0, 100 mm above the world's origin.
 _LEAP_FINGER = [
     ([-0.007, 0.023, -0.0187], [0.500003, 0.5, 0.5, -0.499997], [0, 0, -1]),
     ([-0.0122, 0.0381, 0.0145], [0.500003, -0.5, -0.499997, 0.5], [0, 0, -1]),
-    ([0.015, 0.0143, -0.013], [0.500003, 0.5, -0.5, 0.499997], [0, 0, -1]), ([0, -0.0361, 0.0002], [1, 0, 0, 0], [0, 0, -1]),
+    ([0.015, 0.0143, -0.013], [0.500003, 0.5, -0.5, 0.499997], [0, 0, -1]),
+    ([0, -0.0361, 0.0002], [1, 0, 0, 0], [0, 0, -1]),
 ]  # fmt: skip
 _LEAP_THUMB = [
     ([-0.0693, -0.0012, -0.0216], [0.707109, 0, 0.707105, 0], [0, 0, -1]),
@@ -203,7 +204,7 @@ def files_of(root: Path, config: str, experiment: str = "graspd") -> list[Path]:
 @pytest.fixture(scope="module")
 def bench(hand, block, grasps: GraspSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("bench")
-    dexgraspbench.write(hand, block, grasps, range(len(grasps)), root)
+    dexgraspbench.BenchWriter(root).write(hand, block, grasps, range(len(grasps)))
     return root
 
 
@@ -239,7 +240,7 @@ def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block) -> None:
 def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block, grasps: GraspSet) -> None:
     pieces = bench / np.load(files_of(bench, "graspd_barrett")[0], allow_pickle=True).item()["obj_path"] / "urdf/meshes"
     (pieces / "convex_piece_099.obj").write_text("of another decomposition")
-    dexgraspbench.write(hand, block, grasps, [0], bench)
+    dexgraspbench.BenchWriter(bench).write(hand, block, grasps, [0])
     assert [file.name for file in pieces.iterdir()] == ["convex_piece_000.obj"]
 
 
@@ -247,7 +248,7 @@ def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block, 
 def test_the_evaluators_hand_stands_where_ours_does(name: str, block, tmp_path: Path) -> None:
     hand = hand_from_path(name)
     grasps = random_postures(hand)
-    found = load(tmp_path, dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)[1], f"graspd_{name}")
+    found = load(tmp_path, dexgraspbench.BenchWriter(tmp_path).write(hand, block, grasps, [0, 1])[1], f"graspd_{name}")
     assert found.model.nq == 7 + len(hand.joint_names) + 7
     for posture in dexgraspbench.POSTURES:
         found.at(found.grasp[f"{posture}_qpos"])
@@ -280,7 +281,7 @@ def test_evaluators_bodies_and_actuators_are_those_of_the_hand(bench: Path, hand
 
 def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block, tmp_path, monkeypatch) -> None:
     hand = hand_from_path(shared_data / "hands" / "allegro" / "allegro_hand_right.urdf")
-    (file,) = dexgraspbench.write(hand, block, random_postures(hand), [0], tmp_path)
+    (file,) = dexgraspbench.BenchWriter(tmp_path).write(hand, block, random_postures(hand), [0])
     monkeypatch.chdir(tmp_path)  # nothing may depend on where the export was written
     found = load(tmp_path, file, "graspd_allegro_hand_right")
     meshes = {found.model.mesh(number).name for number in range(found.model.nmesh)}
@@ -300,7 +301,7 @@ def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block, tmp_path
 def test_benchmarks_hand_is_mapped_to_its_model(shared_data, block, tmp_path, config, root, chain, first, tip) -> None:
     hand = hand_from_path(shared_data / "hands" / config / f"{config}_hand_right.urdf")
     grasps = random_postures(hand)
-    dexgraspbench.write(hand, block, grasps, [0], tmp_path)
+    dexgraspbench.BenchWriter(tmp_path).write(hand, block, grasps, [0])
     (npy,) = files_of(tmp_path, config)
     qpos = np.load(npy, allow_pickle=True).item()["grasp_qpos"]
     model = mujoco.MjModel.from_xml_string(_chain(root, chain))
@@ -338,7 +339,7 @@ def test_leap_is_mapped_to_the_benchmarks_model_and_back(base: bool, tmp_path: P
     hand = load_urdf(leap_urdf(base, mirrored=False))
     mapping = benchmark_mapping(hand)
     assert mapping is not None and mapping.config == "leap"
-    assert [ours for _, ours in mapping.joints] == "1 0 2 3 5 4 6 7 9 8 10 11 12 13 14 15".split()
+    assert [ours for _, ours in mapping.joints] == [*"1023546798", *map(str, range(10, 16))]
     (tmp_path / "leap.urdf").write_bytes(leap_urdf(base, mirrored=False))
     oracle = yourdfpy.URDF.load(str(tmp_path / "leap.urdf"), load_meshes=False, build_scene_graph=True)
     posture = random_postures(hand).grasp
@@ -361,7 +362,7 @@ def test_leap_is_mapped_to_the_benchmarks_model_and_back(base: bool, tmp_path: P
 def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block, tmp_path: Path) -> None:
     hand = hand_from_path("shadow")
     grasps = random_postures(hand)
-    dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)
+    dexgraspbench.BenchWriter(tmp_path).write(hand, block, grasps, [0, 1])
     for config in ("shadow", "graspd_shadow"):
         (back,) = dexgraspbench.read(tmp_path / "output" / f"graspd_{config}", hand="shadow", obj="block")
         for name in dexgraspbench.POSTURES:
@@ -377,7 +378,7 @@ def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block, tmp_path:
     [({"root_link": "wrist"}, "has root link 'palm' .*check --hand"), ({"root_in_model": [0, 0, 0]}, "has 3 numbers")],
 )
 def test_a_mapping_of_another_hand_is_told(change: dict, said: str, hand, block, grasps, tmp_path: Path) -> None:
-    (file,) = dexgraspbench.write(hand, block, grasps, [0], tmp_path)
+    (file,) = dexgraspbench.BenchWriter(tmp_path).write(hand, block, grasps, [0])
     mapping = file.parents[3] / "hand_mapping.json"
     mapping.write_text(json.dumps(json.loads(mapping.read_text()) | change))
     with pytest.raises(InputError, match=said):
@@ -497,7 +498,7 @@ def test_an_import_is_validated_by_its_lift(tabletop: Path, candidates: Shard, t
 
 
 def test_free_grasps_and_grasps_on_tables_do_not_mix(tabletop, hand, block, grasps: GraspSet) -> None:
-    dexgraspbench.write(hand, block, grasps, [0], tabletop)
+    dexgraspbench.BenchWriter(tabletop).write(hand, block, grasps, [0])
     assert len(files_of(tabletop, CONFIG)) == 1 and len(files_of(tabletop, CONFIG, EXPERIMENT)) == COUNT
     sets = dexgraspbench.read(tabletop, hand="barrett", obj="block")
     assert [(len(one.grasps), one.placed is None) for one in sets] == [(1, True), (COUNT, False)]
@@ -515,3 +516,32 @@ def test_free_grasps_and_grasps_on_tables_do_not_mix(tabletop, hand, block, gras
 def test_a_scene_that_its_test_does_not_know_is_refused(supports: tuple[Obstacle, ...]) -> None:
     with pytest.raises(InputError, match="--scene table"):
         check_table(PlacedGrasps(supports, invert(np.array([[0, 0, 0, 1.0, 0, 0, 0]])), np.zeros(1, np.intp)))
+
+
+def test_a_folder_of_shards_is_one_benchmark_that_is_evaluated_whole(on_tables: Path, tmp_path: Path) -> None:
+    given, root = tmp_path / "given", tmp_path / "all"
+    given.mkdir()
+    block, mug = (read_shard(on_tables / f"{name}.h5", kind="base") for name in ("block", "mug"))
+    for number, one in enumerate((block, block, mug)):
+        said = one.attributes | {"shard_id": str(number) * 64, "batch": number}
+        (given / f"{number}.h5").write_bytes(write_shard("base", one.arrays, said))
+    done = graspd("export --format dexgraspbench -o", root, given)
+    files = files_of(root, CONFIG, EXPERIMENT)
+    assert (done["grasps"], done["objects"]) == (3 * len(block["quality/valid"]), 2) and len(files) == done["grasps"]
+    for file in files:
+        record = np.load(file, allow_pickle=True).item()
+        scene = np.load(root / record["scene_path"], allow_pickle=True).item()
+        thing = scene["scene"][scene["task"]["obj_name"]]
+        assert thing["pose"].tolist() == record["obj_pose"].tolist() and scene["task"]["obj_name"] == file.parts[-3]
+    # Shards number their scenes from 0; each of the 2 x 2 scenes of the block is a folder, hence an object, of its own.
+    assert {file.parent.name for file in files if file.parts[-3] == "block"} == {
+        f"scale100_pose00{k}" for k in range(4)
+    }
+    found = load(root, files[-1], CONFIG, tabletop=True)
+    assert found.model.nq == 7 + len(block.attributes["joint_names"]) + 7
+    split = {}
+    for name in ("train", "test"):
+        graspd(f"export --format dexgraspbench --held-out 0.5 --split {name} -o", tmp_path / name, given)
+        split[name] = {file.parts[-3] for file in files_of(tmp_path / name, CONFIG, EXPERIMENT)}
+    assert sorted(map(len, split.values())) == [1, 1] and set.union(*split.values()) == {"block", "mug"}
+    assert "all objects are of one family" in refused("export --format dexgraspbench --split test", given / "2.h5")
