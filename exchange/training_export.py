@@ -145,15 +145,15 @@ def split_objects(lots: Iterable[ExportPart], share: float) -> frozenset[str]:
     for lot in lots:
         if lot.name not in known:
             known[lot.name] = lot.obj.digest, shape_signature(lot.obj)
-    return held_out_objects(_families(known), share)
+    return held_out_objects(families_of(known), share)
 
 
 def object_families(objects: Mapping[str, ObjectModel]) -> dict[str, str]:
     """Return each object's family: the least digest of all objects that a chain of similar ones connects."""
-    return _families({name: (obj.digest, shape_signature(obj)) for name, obj in objects.items()})
+    return families_of({name: (obj.digest, shape_signature(obj)) for name, obj in objects.items()})
 
 
-def _families(known: Mapping[str, tuple[str, Floats]]) -> dict[str, str]:
+def families_of(known: Mapping[str, tuple[str, Floats]]) -> dict[str, str]:
     names = sorted(known, key=lambda name: known[name][0])
     found = np.array([known[name][1] for name in names]).reshape(len(names), len(QUANTILES))
     family: dict[str, str] = {}
