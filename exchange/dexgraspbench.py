@@ -47,8 +47,8 @@ def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
     return [_imported_grasps(path, model, obj, sets[key], mapping) for key in sorted(sets)]
 
 
-class BenchWriter:
-    """Writer of grasps of many shards, and of all files that DexGraspBench's evaluator needs, below a folder."""
+class BenchExport:
+    """Export of grasps of many shards, and of all files that DexGraspBench's evaluator needs, below a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._hands = folder, dict[str, list[HandMapping]]()

@@ -58,11 +58,11 @@ def export_training(source: str, format_: str, wishes: TrainingExportOptions, fo
 def export_bench(source: str, wishes: TrainingExportOptions, split: str, folder: Path) -> ExportSummary:
     """Write grasps in DexGraspBench's layout, shard by shard; those of a split (`train`, `test`) or, for "", all.
     Raises InputError like `export_training`, or the split is empty."""
-    from graspd.exchange.dexgraspbench import BenchWriter
+    from graspd.exchange.dexgraspbench import BenchExport
 
     shards, format_ = open_source(source), "dexgraspbench"
     out = split_objects(export_parts(shards, format_, wishes), wishes.held_out) if split else frozenset()
-    writer, count = BenchWriter(folder), 0
+    writer, count = BenchExport(folder), 0
     for lot in export_parts(shards, format_, wishes):
         if not split or (lot.name in out) == (split == "test"):
             prefix = f"{lot.id_hash}-" if len(shards.of_kind("base")) > 1 else ""
@@ -145,15 +145,12 @@ def split_objects(lots: Iterable[ExportPart], share: float) -> frozenset[str]:
     for lot in lots:
         if lot.name not in known:
             known[lot.name] = lot.obj.digest, shape_signature(lot.obj)
-    return held_out_objects(families_of(known), share)
+    return held_out_objects(object_families(known), share)
 
 
-def object_families(objects: Mapping[str, ObjectModel]) -> dict[str, str]:
-    """Return each object's family: the least digest of all objects that a chain of similar ones connects."""
-    return families_of({name: (obj.digest, shape_signature(obj)) for name, obj in objects.items()})
-
-
-def families_of(known: Mapping[str, tuple[str, Floats]]) -> dict[str, str]:
+def object_families(known: Mapping[str, tuple[str, Floats]]) -> dict[str, str]:
+    """Return each object's family: the least digest of all objects that a chain of similar ones connects.
+    `known` has the digest and the `shape_signature` of each object."""
     names = sorted(known, key=lambda name: known[name][0])
     found = np.array([known[name][1] for name in names]).reshape(len(names), len(QUANTILES))
     family: dict[str, str] = {}

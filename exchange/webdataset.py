@@ -43,14 +43,8 @@ def write(
 def open_pictures(
     shards: Shards, *, valid: bool, unvalidated: bool = False, with_grasps_only: bool = False
 ) -> Pictures:
-    return Pictures(
-        shards,
-        _COLUMNS,
-        grasp_quality=("quality/epsilon", "quality/success"),
-        valid=valid,
-        unvalidated=unvalidated,
-        with_grasps_only=with_grasps_only,
-    )
+    which = {"valid": valid, "unvalidated": unvalidated, "with_grasps_only": with_grasps_only}
+    return Pictures(shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), **which)
 
 
 def write_tar(pictures: Pictures, indices: Iterable[int], path: Path) -> None:

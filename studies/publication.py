@@ -18,7 +18,7 @@ import numpy as np
 from graspd.exchange import huggingface, webdataset
 from graspd.exchange.opening import check_written_files
 from graspd.exchange.plan import held_out_objects, plain_name
-from graspd.exchange.training_export import families_of, shape_signature
+from graspd.exchange.training_export import object_families, shape_signature
 from graspd.service import parquet
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
@@ -30,7 +30,7 @@ from graspd.service.store.integrity import CHECKSUMS
 from graspd.service.store.shards import read_shard
 from graspd.studies.cards.card import write_card
 from graspd.studies.cards.contents import Contents
-from graspd.studies.croissant import croissant
+from graspd.studies.cards.page import render_croissant
 from graspd.worker.files.provenance import object_of_shard
 from graspd.worker.files.subsets import require_empty_folder
 
@@ -39,6 +39,12 @@ RECORD: Final = "publication.json"
 SHARDS_A_FILE: Final = 200
 PICTURES_A_FILE: Final = 1000
 SPLITS: Final = ("train", "test")
+_TABLES: Final = {"grasps": huggingface.GRASPS, "pictures": huggingface.PICTURES}
+_TYPES: Final = {"text": "sc:Text", parquet.IMAGE: "sc:ImageObject"}
+#: Folders of data files.
+DATA: Final = (*_TABLES, "webdataset")
+_STATED: Final = ("licence", "source", "digest")
+_KINDS: Final = ("hands", "objects")
 _REPOSITORY: Final = re.compile(r"[\w.-]+/[\w.-]+")
 #: Called with the current step, and the numbers of its finished parts and of all its parts.
 Progress = Callable[[str, int, int], None]
@@ -75,32 +81,31 @@ def publish(contents: Contents, folder: Path, options: PublicationOptions, progr
         _write_whole(draft / RECORD, lambda file: _write_json(file, record))
     with check_written_files(draft):
         _write_data(contents, draft, frozenset(record["test"]), options, progress)
-        files = {table: sorted(draft.glob(f"{table}/*")) for table in ("grasps", "pictures", "webdataset")}
+        files = {table: sorted(draft.glob(f"{table}/*")) for table in DATA}
         splits = [split for split in SPLITS if any(file.name.startswith(split) for file in files["grasps"])]
         publication = {
             "name": name or folder.name,
-            "configs": huggingface.table_configs([t for t in ("grasps", "pictures") if files[t]], splits),
+            "configs": huggingface.table_configs([table for table in _TABLES if files[table]], splits),
             "tars": bool(files["webdataset"]),
             "unknown": unknown,
         }
-        card = write_card(
-            contents,
-            draft,
-            licence=options.licence,
-            source=options.source,
-            progress=lambda done, total: progress("card", done, total),
-            publication=publication,
-        )
-        stated = {
-            kind: {one["name"]: {key: one[key] for key in ("licence", "source", "digest")} for one in made}
-            for kind, made in card["composition"].items()
-            if kind in ("hands", "objects")
+        said: dict[str, Any] = {"licence": options.licence, "source": options.source, "publication": publication}
+        card = write_card(contents, draft, progress=lambda done, total: progress("card", done, total), **said)
+        assets = {
+            kind: {one["name"]: {key: one[key] for key in _STATED} for one in card["composition"][kind]}
+            for kind in _KINDS
         }
-        _write_json(draft / "licences.json", {"dataset": options.licence or None, **stated})
+        _write_json(draft / "licences.json", {"dataset": options.licence or None, **assets})
         if contents.snapshot is not None:
             (draft / "snapshot.json").write_text(contents.snapshot.model_dump_json(indent=1) + "\n")
         sums = {file: _sha256(file) for found in files.values() for file in found}
-        _write_json(draft / "croissant.json", croissant(card, draft, sums))
+        facts = [{"name": str(f.relative_to(draft)), "size": f.stat().st_size, "sha256": s} for f, s in sums.items()]
+        tables = {
+            table: {name: _croissant_type(word) for name, word in columns.items()}
+            for table, columns in _TABLES.items()
+            if files[table]
+        }
+        (draft / "croissant.json").write_text(render_croissant(card, facts, tables))
     written = sorted(file for file in draft.rglob("*") if file.is_file() and file.name != CHECKSUMS)
     lines = (f"{sums.get(file) or _sha256(file)}  {file.relative_to(draft)}\n" for file in written)
     (draft / CHECKSUMS).write_text("".join(lines))
@@ -140,7 +145,7 @@ def _test_objects(contents: Contents, share: float) -> frozenset[str]:
         except NotFoundError as error:
             raise NotFoundError(f"the split needs all objects, but {error}, or make no split: --held-out 0") from None
         known[name] = obj.digest, shape_signature(obj)
-    return held_out_objects(families_of(known), share)
+    return held_out_objects(object_families(known), share)
 
 
 def _write_data(
@@ -180,8 +185,7 @@ def _parts(pictures: Pictures) -> list[range]:
 def _grasp_rows(contents: Contents, files: list[ShardFile], *, every: bool) -> Iterator[list[dict[str, Any]]]:
     for file in files:
         shard = read_shard(contents.shards.path(file), kind="base")
-        mask = validity.valid_mask(shard.arrays)
-        rows = np.flatnonzero(mask | every)
+        rows = np.flatnonzero(validity.valid_mask(shard.arrays) | every)
         if len(rows):
             yield huggingface.grasp_rows(shard, file.id, plain_name(file.object), rows)
 
@@ -205,6 +209,12 @@ def _write_json(file: Path, value: Any) -> None:
     file.write_text(json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
+def _croissant_type(word: str) -> tuple[str, str]:
+    """Return Croissant's type and shape of a column; the last suffix of a type's name is the outer list."""
+    kind, lengths = word.split("[")[0], re.findall(r"\[(\d*)\]", word)
+    return _TYPES.get(kind, f"cr:{kind.capitalize()}"), ",".join(length or "-1" for length in reversed(lengths))
+
+
 def _sha256(file: Path) -> str:
     with file.open("rb") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()
@@ -226,24 +236,16 @@ class Hub:
 
     def upload(self, folder: Path, *, public: bool) -> str:
         """Upload a folder as one commit; return its address. Data files of an earlier upload are replaced."""
-        options: dict[str, Any] = {"repo_type": "dataset"}
-        self._call(self._api.create_repo, self.repository, private=not public, exist_ok=True, **options)
-        stale = [f"{table}/*" for table in ("grasps", "pictures", "webdataset")]
-        done = self._call(
-            self._api.upload_folder,
-            repo_id=self.repository,
-            folder_path=folder,
-            commit_message=f"graspd {PACKAGE_VERSION}: {folder.name}",
-            delete_patterns=stale,
-            **options,
-        )
+        name, kind = self.repository, "dataset"
+        self._call(self._api.create_repo, name, repo_type=kind, private=not public, exist_ok=True)
+        options = {"repo_type": kind, "delete_patterns": [f"{table}/*" for table in DATA]}
+        said = f"graspd {PACKAGE_VERSION}: {folder.name}"
+        done = self._call(self._api.upload_folder, repo_id=name, folder_path=folder, commit_message=said, **options)
         return str(done.commit_url)
 
     def _call(self, method: Callable[..., Any], *args: Any, **options: Any) -> Any:
         try:
             return method(*args, **options)
-        except (OSError, ValueError, RuntimeError) as error:  # its errors, and those of its HTTP library
-            problem = " ".join(str(error).split())[:300]
-            raise UnavailableError(
-                f"the hub refuses {self.repository}: {problem}; repeat the command to go on"
-            ) from None
+        except Exception as error:  # its errors, and those of its HTTP library
+            problem = f"{self.repository} cannot be published: {' '.join(str(error).split())[:300]}"
+            raise UnavailableError(f"{problem}; repeat the command to go on") from None

@@ -2,7 +2,7 @@
 
 import json
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -72,6 +72,11 @@ def render_card(card: Row, plots: Mapping[str, str], publication: Row | None = N
         gate=f"penetration at most {gates.MAX_PENETRATION_MM:g} mm, self-penetration at most "
         f"{gates.MAX_SELF_PENETRATION_MM:g} mm, at least {gates.MIN_CONTACT_LINKS} links in contact",
     )
+
+
+def render_croissant(card: Row, files: Sequence[Row], tables: Mapping[str, Mapping[str, tuple[str, str]]]) -> str:
+    """Return the Croissant file; `files` have name, size and sha256, columns type and shape ("": scalar)."""
+    return _CROISSANT.render(card, files=files, tables=tables)
 
 
 def yaml_head(card: Row, publication: Row | None = None) -> dict[str, Any]:
@@ -223,3 +228,4 @@ _ENVIRONMENT.filters |= {
     "size": _size,
 }
 _TEMPLATE: Final = _ENVIRONMENT.get_template("page.md.j2")
+_CROISSANT: Final = _ENVIRONMENT.get_template("croissant.json.j2")

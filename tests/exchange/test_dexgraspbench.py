@@ -204,7 +204,7 @@ def files_of(root: Path, config: str, experiment: str = "graspd") -> list[Path]:
 @pytest.fixture(scope="module")
 def bench(hand, block, grasps: GraspSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("bench")
-    dexgraspbench.BenchWriter(root).write(hand, block, grasps, range(len(grasps)))
+    dexgraspbench.BenchExport(root).write(hand, block, grasps, range(len(grasps)))
     return root
 
 
@@ -240,7 +240,7 @@ def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block) -> None:
 def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block, grasps: GraspSet) -> None:
     pieces = bench / np.load(files_of(bench, "graspd_barrett")[0], allow_pickle=True).item()["obj_path"] / "urdf/meshes"
     (pieces / "convex_piece_099.obj").write_text("of another decomposition")
-    dexgraspbench.BenchWriter(bench).write(hand, block, grasps, [0])
+    dexgraspbench.BenchExport(bench).write(hand, block, grasps, [0])
     assert [file.name for file in pieces.iterdir()] == ["convex_piece_000.obj"]
 
 
@@ -248,7 +248,7 @@ def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block, 
 def test_the_evaluators_hand_stands_where_ours_does(name: str, block, tmp_path: Path) -> None:
     hand = hand_from_path(name)
     grasps = random_postures(hand)
-    found = load(tmp_path, dexgraspbench.BenchWriter(tmp_path).write(hand, block, grasps, [0, 1])[1], f"graspd_{name}")
+    found = load(tmp_path, dexgraspbench.BenchExport(tmp_path).write(hand, block, grasps, [0, 1])[1], f"graspd_{name}")
     assert found.model.nq == 7 + len(hand.joint_names) + 7
     for posture in dexgraspbench.POSTURES:
         found.at(found.grasp[f"{posture}_qpos"])
@@ -281,7 +281,7 @@ def test_evaluators_bodies_and_actuators_are_those_of_the_hand(bench: Path, hand
 
 def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block, tmp_path, monkeypatch) -> None:
     hand = hand_from_path(shared_data / "hands" / "allegro" / "allegro_hand_right.urdf")
-    (file,) = dexgraspbench.BenchWriter(tmp_path).write(hand, block, random_postures(hand), [0])
+    (file,) = dexgraspbench.BenchExport(tmp_path).write(hand, block, random_postures(hand), [0])
     monkeypatch.chdir(tmp_path)  # nothing may depend on where the export was written
     found = load(tmp_path, file, "graspd_allegro_hand_right")
     meshes = {found.model.mesh(number).name for number in range(found.model.nmesh)}
@@ -301,7 +301,7 @@ def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block, tmp_path
 def test_benchmarks_hand_is_mapped_to_its_model(shared_data, block, tmp_path, config, root, chain, first, tip) -> None:
     hand = hand_from_path(shared_data / "hands" / config / f"{config}_hand_right.urdf")
     grasps = random_postures(hand)
-    dexgraspbench.BenchWriter(tmp_path).write(hand, block, grasps, [0])
+    dexgraspbench.BenchExport(tmp_path).write(hand, block, grasps, [0])
     (npy,) = files_of(tmp_path, config)
     qpos = np.load(npy, allow_pickle=True).item()["grasp_qpos"]
     model = mujoco.MjModel.from_xml_string(_chain(root, chain))
@@ -362,7 +362,7 @@ def test_leap_is_mapped_to_the_benchmarks_model_and_back(base: bool, tmp_path: P
 def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block, tmp_path: Path) -> None:
     hand = hand_from_path("shadow")
     grasps = random_postures(hand)
-    dexgraspbench.BenchWriter(tmp_path).write(hand, block, grasps, [0, 1])
+    dexgraspbench.BenchExport(tmp_path).write(hand, block, grasps, [0, 1])
     for config in ("shadow", "graspd_shadow"):
         (back,) = dexgraspbench.read(tmp_path / "output" / f"graspd_{config}", hand="shadow", obj="block")
         for name in dexgraspbench.POSTURES:
@@ -378,7 +378,7 @@ def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block, tmp_path:
     [({"root_link": "wrist"}, "has root link 'palm' .*check --hand"), ({"root_in_model": [0, 0, 0]}, "has 3 numbers")],
 )
 def test_a_mapping_of_another_hand_is_told(change: dict, said: str, hand, block, grasps, tmp_path: Path) -> None:
-    (file,) = dexgraspbench.BenchWriter(tmp_path).write(hand, block, grasps, [0])
+    (file,) = dexgraspbench.BenchExport(tmp_path).write(hand, block, grasps, [0])
     mapping = file.parents[3] / "hand_mapping.json"
     mapping.write_text(json.dumps(json.loads(mapping.read_text()) | change))
     with pytest.raises(InputError, match=said):
@@ -498,7 +498,7 @@ def test_an_import_is_validated_by_its_lift(tabletop: Path, candidates: Shard, t
 
 
 def test_free_grasps_and_grasps_on_tables_do_not_mix(tabletop, hand, block, grasps: GraspSet) -> None:
-    dexgraspbench.BenchWriter(tabletop).write(hand, block, grasps, [0])
+    dexgraspbench.BenchExport(tabletop).write(hand, block, grasps, [0])
     assert len(files_of(tabletop, CONFIG)) == 1 and len(files_of(tabletop, CONFIG, EXPERIMENT)) == COUNT
     sets = dexgraspbench.read(tabletop, hand="barrett", obj="block")
     assert [(len(one.grasps), one.placed is None) for one in sets] == [(1, True), (COUNT, False)]
