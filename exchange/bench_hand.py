@@ -255,10 +255,23 @@ _ALLEGRO_URDFS: Final = (
         for part in ("rotation" if finger == "thumb" else "abduction", "proximal", "middle", "distal")
     ),
 )
+_LEAP: Final = (
+    *(f"{finger}_{part}" for finger in ("if", "mf", "rf") for part in ("mcp", "rot", "pip", "dip")),
+    *(f"th_{part}" for part in ("cmc", "axl", "mcp", "ipl")),
+)
+#: Palm and joints, in the order of `_LEAP`, of MuJoCo Menagerie's file and of the vendor's URDF.
+_LEAP_FILES: Final = (
+    ("palm", _LEAP),
+    ("palm_lower", ("1", "0", "2", "3", "5", "4", "6", "7", "9", "8", *(str(number) for number in range(10, 16)))),
+)
 #: Pose of the palm of DexGraspBench's Allegro hand in the model's world frame: a rotation alone.
 _ALLEGRO_ROOT: Final = (0.0, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.5**0.5)
 #: Pose of the palm of DexGraspBench's Shadow hand. The wrist below the palm is omitted.
 _SHADOW_ROOT: Final = (0.0, 0.0, 0.034, 1.0, 0.0, 0.0, 0.0)
+#: Pose of the palm of DexGraspBench's LEAP hand, and the place of the first joint in its frame [m]. The left hand has
+#: the same names, but another place.
+_LEAP_ROOT: Final = (0.0, 0.0, 0.1, 0.0, 1.0, 0.0, 0.0)
+_LEAP_FIRST: Final = (-0.007, 0.023, -0.0187)
 
 
 def benchmark_mapping(hand: HandModel) -> HandMapping | None:
@@ -272,4 +285,11 @@ def benchmark_mapping(hand: HandModel) -> HandMapping | None:
             return mapping("allegro", _ALLEGRO_ROOT, tuple(zip(_ALLEGRO, names, strict=True)))
     if set(_SHADOW) == set(hand.joint_names) and hand.root_link == "palm":
         return mapping("shadow", _SHADOW_ROOT, tuple((f"rh_{name}", name) for name in _SHADOW))
+    for palm, names in _LEAP_FILES:
+        body, pose = hand.frames.get(palm, (-1, IDENTITY_POSE))
+        if body == 0 and set(names) == set(hand.joint_names):
+            first = hand.origin[hand.joint_body[hand.joint_names.index(names[0])]]
+            if np.allclose(compose(invert(pose), first)[:3], _LEAP_FIRST, rtol=0, atol=1e-3):
+                root = compose(np.array(_LEAP_ROOT), invert(pose))
+                return mapping("leap", tuple(root.tolist()), tuple(zip(_LEAP, names, strict=True)))
     return None

@@ -3,7 +3,7 @@
 docs/how-to/exchange/dexgraspbench.md describes files and fields. `..._qpos` have root and joint order of the model that
 a benchmark's configuration names; `HandMapping` relates both to graspd's hand."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -47,48 +47,67 @@ def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
     return [_imported_grasps(path, model, obj, sets[key], mapping) for key in sorted(sets)]
 
 
-def write(
-    hand: HandModel,
-    obj: ObjectModel,
-    grasps: GraspSet,
-    rows: Sequence[int],
-    folder: Path,
-    placed: PlacedGrasps | None = None,
-) -> list[Path]:
-    """Write grasps and all files that DexGraspBench's evaluator needs.
-    Return the grasp files of the first experiment. The object is at the origin or, for `placed` grasps, on its table.
-    Each of `write_models` gets an experiment. Raises InputError: the scenes are no tables."""
-    if placed is not None:
-        bench_scene.check_table(placed)
-    name = plain_name(obj.name)
-    obj_path, scene = bench_scene.write_object(obj, name, folder)
-    scenes = {0: (IDENTITY_POSE, scene)}
-    number = np.zeros(len(grasps), np.intp)
-    if placed is not None:
-        number = placed.index
-        poses = np.asarray(placed.object_pose, float)
-        scenes = {
-            k: (poses[k], bench_scene.write_table(name, poses[k], k, folder)) for k in sorted(set(number[list(rows)]))
-        }
-    paths: list[Path] = []
-    for mapping in write_models(hand, folder):
-        out = folder / "output" / f"{experiment_name(placed)}_{mapping.config}"
-        mapping.write(out)
-        written = [out / GRASPS / name / f"{bench_scene.SCALE}_pose{number[row]:03}" / f"{row}.npy" for row in rows]
-        for row, file in zip(rows, written, strict=True):
-            pose, path = scenes[number[row]]
-            record: bench_scene.Row = {
-                "obj_path": obj_path.as_posix(),
-                "obj_scale": 1.0,
-                "obj_pose": pose.copy(),
-                "scene_path": path.as_posix(),
-            }
-            record |= qpos_fields(mapping, hand, grasps, row, None if placed is None else pose)
-            if placed is not None:
-                record |= bench_scene.tabletop_fields(mapping, hand, grasps, row, pose)
-            bench_scene.save_record(file, record)
-        paths = paths or written
-    return paths
+class BenchExport:
+    """Export of grasps of many shards, and of all files that DexGraspBench's evaluator needs, below a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._hands = folder, dict[str, list[HandMapping]]()
+        self.objects: dict[str, tuple[Path, Path]] = {}  # folder and scene file of each object
+        self._scenes = Counter[str]()
+
+    def write(
+        self,
+        hand: HandModel,
+        obj: ObjectModel,
+        grasps: GraspSet,
+        rows: Sequence[int],
+        placed: PlacedGrasps | None = None,
+        *,
+        name: str = "",
+        prefix: str = "",
+    ) -> list[Path]:
+        """Write grasps; return the grasp files of the first experiment.
+        The object is at the origin or, for `placed` grasps, on its table; scenes of an object are numbered on. Each of
+        `write_models` gets an experiment. Raises InputError: the scenes are no tables."""
+        if placed is not None:
+            bench_scene.check_table(placed)
+        folder, name = self._folder, name or plain_name(obj.name)
+        if name not in self.objects:
+            self.objects[name] = bench_scene.write_object(obj, name, folder)
+        if hand.digest not in self._hands:
+            self._hands[hand.digest] = write_models(hand, folder)
+        obj_path, scene = self.objects[name]
+        scenes = {0: (IDENTITY_POSE, scene)}
+        number = np.zeros(len(grasps), np.intp)
+        first = 0
+        if placed is not None:
+            number, first = placed.index, self._scenes[name]
+            poses = np.asarray(placed.object_pose, float)
+            self._scenes[name] += len(poses)
+            used = sorted(set(number[list(rows)].tolist()))
+            scenes = {k: (poses[k], bench_scene.write_table(name, poses[k], first + k, folder)) for k in used}
+        paths: list[Path] = []
+        for mapping in self._hands[hand.digest]:
+            out = folder / "output" / f"{experiment_name(placed)}_{mapping.config}"
+            mapping.write(out)
+            place = out / GRASPS / name
+            written = [
+                place / f"{bench_scene.SCALE}_pose{first + number[row]:03}" / f"{prefix}{row}.npy" for row in rows
+            ]
+            for row, file in zip(rows, written, strict=True):
+                pose, path = scenes[number[row]]
+                record: bench_scene.Row = {
+                    "obj_path": obj_path.as_posix(),
+                    "obj_scale": 1.0,
+                    "obj_pose": pose.copy(),
+                    "scene_path": path.as_posix(),
+                }
+                record |= qpos_fields(mapping, hand, grasps, row, None if placed is None else pose)
+                if placed is not None:
+                    record |= bench_scene.tabletop_fields(mapping, hand, grasps, row, pose)
+                bench_scene.save_record(file, record)
+            paths = paths or written
+        return paths
 
 
 def write_models(hand: HandModel, folder: Path) -> list[HandMapping]:

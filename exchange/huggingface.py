@@ -4,7 +4,7 @@
 
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +21,7 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats
 from graspd.service.readers import DepthNoise, Pictures
 from graspd.service.readers.clouds import CloudView
 from graspd.service.readers.trajectories import scene_spec_of
+from graspd.service.store.shards import Shard
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.rendering.export import PNG_STEP_M
@@ -89,18 +90,11 @@ def write(
         done.counts["files"] += 1
         if len(pictures):
             file = folder / "pictures" / f"{split}-00000.parquet"
-            groups = _groups(pictures, {lot.id: lot.name for lot in mine}, noise)
+            groups = picture_rows(pictures, range(len(pictures)), {lot.id: lot.name for lot in mine}, noise)
             done.counts["pictures"] += parquet.write(file, parquet.arrow_schema(PICTURES), groups)
             done.counts["files"] += 1
     splits = [split for split, some in sides.items() if some]
-    tables = [
-        {
-            "config_name": table,
-            "default": table == "grasps",
-            "data_files": [{"split": split, "path": f"{table}/{split}-*.parquet"} for split in splits],
-        }
-        for table in (["grasps", "pictures"] if len(pictures) else ["grasps"])
-    ]
+    tables = table_configs(["grasps", "pictures"] if len(pictures) else ["grasps"], splits)
     # The YAML head of the card is JSON, which is valid YAML.
     (folder / "README.md").write_text(
         f"---\nconfigs: {json.dumps(tables)}\n---\n\n# Grasps made with graspd\n\n"
@@ -109,22 +103,42 @@ def write(
     return done
 
 
+def table_configs(tables: Sequence[str], splits: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the `configs` of a dataset card: tables `TABLE/SPLIT-*.parquet`, the first one as the default."""
+    return [
+        {
+            "config_name": table,
+            "default": table == tables[0],
+            "data_files": [{"split": split, "path": f"{table}/{split}-*.parquet"} for split in splits],
+        }
+        for table in tables
+    ]
+
+
 def _grasps(lot: ExportPart) -> list[dict[str, Any]]:
-    said, arrays = lot.shard.attributes, lot.shard.arrays
+    own = {"hand": lot.hand.name, "root_link": lot.hand.root_link, "joint_names": list(lot.hand.joint_names)}
+    return [row | own for row in grasp_rows(lot.shard, lot.id, lot.name, lot.rows)]
+
+
+def grasp_rows(shard: Shard, shard_id: str, obj: str, selected: NDArray[np.intp]) -> list[dict[str, Any]]:
+    """Return rows of the table of grasps: the selected ones of a base shard, on the object of this name."""
+    said, arrays, grasps = shard.attributes, shard.arrays, GraspSet.from_columns(shard.arrays)
+    placed = np.asarray(arrays["scene/object_pose"], float) if "scene/object_pose" in arrays else None
+    verdict = np.asarray(arrays.get("quality/success", np.full(len(grasps), -1)), np.int8)
     epsilon = metric_at_threshold(arrays, "quality/epsilon")
-    spec = scene_spec_of(lot.shard)
-    kind = FREE if lot.placed is None or spec is None else spec.kind
-    types = np.asarray(arrays.get("quality/grasp_type", np.zeros(len(lot.grasps), int)))
+    spec = scene_spec_of(shard)
+    kind = FREE if placed is None or spec is None else spec.kind
+    types = np.asarray(arrays.get("quality/grasp_type", np.zeros(len(grasps), int)))
     rows = []
-    for row in lot.rows.tolist():
+    for row in selected.tolist():
         one: dict[str, Any] = {
-            "hand": lot.hand.name,
-            "object": lot.name,
-            "shard": lot.id,
+            "hand": str(said.get("hand", "")),
+            "object": obj,
+            "shard": shard_id,
             "row": row,
-            "root_link": lot.hand.root_link,
-            "joint_names": list(lot.hand.joint_names),
-            "verdict": int(lot.verdict[row]),
+            "root_link": str(said.get("root_link", "")),
+            "joint_names": said.get("joint_names", []),
+            "verdict": int(verdict[row]),
             "verdict_level": str(said.get("verdict_level", "none")),
             "epsilon": float(epsilon[row]),
             "penetration_depth_mm": float(arrays["quality/penetration_depth_mm"][row]),
@@ -133,19 +147,23 @@ def _grasps(lot: ExportPart) -> list[dict[str, Any]]:
             "scene": -1,
             "object_pose": IDENTITY_POSE.tolist(),
         }
-        if lot.placed is not None:
-            scene = int(lot.placed.index[row])
-            one |= {"scene": scene, "object_pose": np.asarray(lot.placed.object_pose[scene], float).tolist()}
+        if placed is not None:
+            scene = int(arrays["grasp/scene_index"][row])
+            one |= {"scene": scene, "object_pose": placed[scene].tolist()}
         for name in POSTURES:
-            part: Posture = getattr(lot.grasps, name)
+            part: Posture = getattr(grasps, name)
             one |= {f"{name}_pose": part.hand_pose[row].tolist(), f"{name}_joints": part.joint_positions[row].tolist()}
         rows.append(one)
     return rows
 
 
-def _groups(pictures: Pictures, names: Mapping[str, str], noise: DepthNoise | None) -> Iterator[list[dict[str, Any]]]:
+def picture_rows(
+    pictures: Pictures, indices: Iterable[int], names: Mapping[str, str], noise: DepthNoise | None = None
+) -> Iterator[list[dict[str, Any]]]:
+    """Yield groups of rows of the table of pictures; `names` has the object of each base shard to include."""
     group: list[dict[str, Any]] = []
-    for index, sample in enumerate(pictures):
+    for index in indices:
+        sample = pictures[index]
         if sample["base_id"] in names:
             depth = CloudView(sample, noise, np.random.default_rng(index)).seen
             group.append(_picture(sample, names[sample["base_id"]], depth))

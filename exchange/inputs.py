@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from graspd.exchange import dexgraspbench, published
 from graspd.service.model.errors import InputError, NotFoundError
-from graspd.service.store.shards import open_shard, read_shard, shard_kind
+from graspd.service.store.shards import Shard, open_shard, read_shard, shard_kind
 from graspd.worker.files.provenance import hand_of_shard, object_of_shard, scenes_of_shard
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
@@ -82,13 +82,19 @@ def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) ->
 
 def _load_shard(path: Path, hand: str | None, obj: str | None) -> Case:
     shard = read_shard(path, kind="base")
-    model, thing = hand_of_shard(shard, hand), object_of_shard(shard, obj)
+    return case_of_shard(shard, hand_of_shard(shard, hand), object_of_shard(shard, obj))
+
+
+def case_of_shard(shard: Shard, model: HandModel, thing: ObjectModel) -> Case:
+    """Return the grasps of a base shard that was read from a file.
+    Raises InputError: the shard has another number of joints than the hand."""
+    assert shard.path is not None
     grasps = GraspSet.from_columns(shard.arrays)
     if (joints := grasps.grasp.joint_positions.shape[1]) != len(model.joint_names):
-        raise InputError(f"{path} has {joints} joints, but {model.name} has {len(model.joint_names)}; plan again")
+        raise InputError(f"{shard.path} has {joints} joints, but {model.name} has {len(model.joint_names)}; plan again")
     said = shard.attributes
     return Case(
-        path.name,
+        shard.path.name,
         model,
         thing,
         grasps,

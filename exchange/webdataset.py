@@ -6,7 +6,7 @@ import io
 import json
 import tarfile
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -26,9 +26,7 @@ def write(
 ) -> list[Path]:
     """Write the pictures of views shards to `pictures-NNNNNN.tar`; `Pictures` selects their grasps.
     Raises InputError: there are no pictures, or `folder` has such files already."""
-    pictures = Pictures(
-        shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), valid=valid, unvalidated=unvalidated
-    )
+    pictures = open_pictures(shards, valid=valid, unvalidated=unvalidated)
     if not len(pictures):
         raise InputError("the shards contain no picture; submit the job with views, or run graspd render")
     folder.mkdir(parents=True, exist_ok=True)
@@ -37,14 +35,26 @@ def write(
     written = []
     for first in range(0, len(pictures), pictures_a_file):
         path = folder / f"pictures-{first // pictures_a_file:06}.tar"
-        with tarfile.open(path, "w") as tar:
-            for index in range(first, min(first + pictures_a_file, len(pictures))):
-                for name, data in _sample_files(shards, pictures[index]):
-                    entry = tarfile.TarInfo(f"{index:08}.{name}")
-                    entry.size = len(data)
-                    tar.addfile(entry, io.BytesIO(data))
+        write_tar(pictures, range(first, min(first + pictures_a_file, len(pictures))), path)
         written.append(path)
     return written
+
+
+def open_pictures(
+    shards: Shards, *, valid: bool, unvalidated: bool = False, with_grasps_only: bool = False
+) -> Pictures:
+    which = {"valid": valid, "unvalidated": unvalidated, "with_grasps_only": with_grasps_only}
+    return Pictures(shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), **which)
+
+
+def write_tar(pictures: Pictures, indices: Iterable[int], path: Path) -> None:
+    """Write some of the pictures as samples of one tar file."""
+    with tarfile.open(path, "w") as tar:
+        for index in indices:
+            for name, data in _sample_files(pictures.shards, pictures[index]):
+                entry = tarfile.TarInfo(f"{index:08}.{name}")
+                entry.size = len(data)
+                tar.addfile(entry, io.BytesIO(data))
 
 
 def _sample_files(shards: Shards, sample: dict[str, Any]) -> Iterator[tuple[str, bytes]]:

@@ -73,6 +73,7 @@ JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("objects", "check", "graspd.commands.objects", "Check whether a mesh can be used, and report repairs."),
     ("datasets", "balance", "graspd.commands.curate", "Write a subset in which no kind of grasps dominates."),
     ("datasets", "card", "graspd.commands.exchange", "Write a dataset's card: contents, quality, biases, plots."),
+    ("datasets", "publish", "graspd.commands.exchange", "Write a dataset for a hub, and upload it."),
 )
 
 #: For each package: a module that it needs, and the extra that installs this module.

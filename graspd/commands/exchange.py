@@ -1,11 +1,12 @@
-"""Command line: `graspd export`, `graspd import` and `graspd datasets card`."""
+"""Command line: `graspd export`, `graspd import`, `graspd datasets card` and `graspd datasets publish`."""
 
 from __future__ import annotations
 
 import json as jsonlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
 import typer
@@ -20,7 +21,10 @@ from graspd.service.store.shards import read_shard
 from graspd.service.store.store import open_store
 from graspd.service.store.usd_layers import import_usd
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, select_grasps
+from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, open_source
+
+if TYPE_CHECKING:
+    from graspd.studies.cards.contents import Contents
 
 app = CommandGroup(no_args_is_help=True)
 
@@ -36,7 +40,9 @@ IMPORTS: Final = (
 
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
 def export(
-    source: Annotated[Path, typer.Argument(help="Shard; for webdataset and training formats a folder of shards.")],
+    source: Annotated[
+        str, typer.Argument(help="Shard; for dexgraspbench, webdataset and training a folder or dataset, too.")
+    ],
     format_: Annotated[str, typer.Option("--format", help=", ".join(EXPORTS) + ".")] = "images",
     hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
     object_: Annotated[str | None, typer.Option("--object", help="Object file; default: found by its digest.")] = None,
@@ -54,7 +60,8 @@ def export(
         str | None, typer.Option(help="Pose of the arm's base in the scene or object frame: x y z qw qx qy qz.")
     ] = None,
     mount_pose: Annotated[str | None, typer.Option(help="Pose of the hand in the mount: x y z qw qx qy qz.")] = None,
-    held_out: Annotated[float, typer.Option(help="For training: share of held-out objects.")] = 0.2,
+    held_out: Annotated[float, typer.Option(help="For training and splits: share of held-out objects.")] = 0.2,
+    split: Annotated[str, typer.Option(help="For dexgraspbench: only one split, train or test; default: all.")] = "",
     noise: Annotated[str, typer.Option(help="For training: noise of depth, stereo or structured_light.")] = "",
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("export"),
     json: JsonFlag = False,
@@ -64,24 +71,27 @@ def export(
         raise InputError(f"there is no export format {format_!r}; choose one of {choices_text(format_, EXPORTS)}")
     if depth not in ("exr", "png"):
         raise InputError(f"there is no depth format {depth!r}; use exr or png")
+    if split not in ("", "train", "test"):
+        raise InputError(f"there is no split {split!r}; use train or test")
     with check_written_files(output):
         if format_ in ROBOTS:
             from graspd.exchange.robot_export import RobotExportOptions, export_grasps
 
             of_robot = (best, tool, speed, arm, mount, base, mount_pose)
             robot = RobotExportOptions(hand, object_, unvalidated, every, *of_robot)
-            done = export_grasps(source, format_, robot, output)
-        elif format_ in TRAINING:
-            from graspd.exchange.training_export import TrainingExportOptions, export_training
+            done = export_grasps(Path(source), format_, robot, output)
+        elif format_ in (*TRAINING, "dexgraspbench"):
+            from graspd.exchange.training_export import TrainingExportOptions, export_bench, export_training
 
             training = TrainingExportOptions(hand, object_, unvalidated, every, held_out, noise)
-            done = export_training(source, format_, training, output)
+            if format_ == "dexgraspbench":
+                done = export_bench(source, training, split, output)
+            else:
+                done = export_training(source, format_, training, output)
         elif format_ == "webdataset":
             done = _export_webdataset(source, output, unvalidated=unvalidated, every=every)
-        elif format_ == "dexgraspbench":
-            done = _export_dexgraspbench(source, hand, object_, output, unvalidated=unvalidated, every=every)
         else:
-            done = _export_pictures(source, format_, depth, output)
+            done = _export_pictures(Path(source), format_, depth, output)
     told = {"folder": str(output), "format": format_, **done.counts, **({"notes": done.notes} if done.notes else {})}
     line = f"{output}: " + ", ".join(f"{n} {what}" for what, n in done.counts.items() if isinstance(n, int))
     print_result(told, line, json=json)
@@ -177,26 +187,13 @@ def _export_pictures(source: Path, format_: str, depth: str, output: Path) -> Ex
     return ExportSummary({"pictures": len(views["camera/eye"]), "files": len(written)})
 
 
-def _export_webdataset(source: Path, output: Path, *, unvalidated: bool, every: bool) -> ExportSummary:
+def _export_webdataset(source: str, output: Path, *, unvalidated: bool, every: bool) -> ExportSummary:
     from graspd.exchange import webdataset
-    from graspd.service.readers import Pictures, open_shards
+    from graspd.service.readers import Pictures
 
-    shards = open_shards(source)
+    shards = open_source(source)
     written = webdataset.write(shards, output, valid=not every, unvalidated=unvalidated)
     return ExportSummary({"pictures": len(Pictures(shards)), "files": len(written)})
-
-
-def _export_dexgraspbench(
-    source: Path, hand: str | None, obj: str | None, output: Path, *, unvalidated: bool, every: bool
-) -> ExportSummary:
-    from graspd.exchange import dexgraspbench
-    from graspd.exchange.inputs import load_case
-
-    case = load_case(source, hand=hand, obj=obj)
-    mask, _ = select_grasps(read_shard(source, kind="base"), unvalidated=unvalidated, every=every)
-    rows = np.flatnonzero(mask)
-    written = dexgraspbench.write(case.hand, case.obj, case.grasps, rows.tolist(), output, case.placed)
-    return ExportSummary({"grasps": len(written), "files": len(written)})
 
 
 def _summary(file: Path) -> dict[str, Any]:
@@ -235,19 +232,79 @@ def simready(
         typer.echo(note, err=True)
 
 
+SourceName = Annotated[str, typer.Argument(metavar="NAME", help="Dataset of the store, or folder: ./kitchen-v1.")]
+SnapshotOption = Annotated[str | None, typer.Option(help="Digest of a snapshot; default: the newest.")]
+LicenceOption = Annotated[str, typer.Option(help="SPDX licence of grasps and pictures, such as CC-BY-4.0.")]
+OriginOption = Annotated[str, typer.Option("--source", help="Origin or contact, in one sentence.")]
+AssetsOption = Annotated[Path | None, typer.Option(help="JSON file of missing licences and sources of assets.")]
+
+
 @app.command(epilog="graspd datasets card kitchen -o kitchen-v1 --licence CC-BY-4.0")
 def card(
-    source: Annotated[str, typer.Argument(metavar="NAME", help="Dataset of the store, or folder: ./kitchen-v1.")],
+    source: SourceName,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the card.")],
-    snapshot: Annotated[str | None, typer.Option(help="Digest of a snapshot; default: the newest.")] = None,
-    licence: Annotated[str, typer.Option(help="SPDX licence of grasps and pictures, such as CC-BY-4.0.")] = "",
-    text: Annotated[str, typer.Option("--source", help="Origin or contact, in one sentence.")] = "",
-    assets: Annotated[Path | None, typer.Option(help="JSON file of missing licences and sources of assets.")] = None,
+    snapshot: SnapshotOption = None,
+    licence: LicenceOption = "",
+    text: OriginOption = "",
+    assets: AssetsOption = None,
     data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
     """Write a dataset's card: contents, origin, quality and biases; with plots and checksums."""
     from graspd.studies.cards.card import write_card
+
+    contents = _contents(source, snapshot, assets, data_dir)
+    with _progress(json=json) as report:
+        found = write_card(
+            contents, out, licence=licence, source=text, progress=lambda done, total: report("shards", done, total)
+        )
+    made = found["composition"]
+    told = {"out": str(out), "dataset": found["name"], "snapshot": (found["snapshot"] or {}).get("digest")}
+    told |= {"grasps": made["grasps"], "valid": made["valid"], "pictures": made["pictures"], "plots": found["plots"]}
+    line = f"{out}/README.md: {made['valid']:,} valid grasps, {len(found['plots'])} plots, checksums, card.json"
+    print_result(told, line, json=json)
+
+
+@app.command(epilog="graspd datasets publish kitchen --to hf://my-lab/kitchen --licence CC-BY-4.0")
+def publish(
+    source: SourceName,
+    to: Annotated[str, typer.Option(help="Folder, or hf://ORGANISATION/NAME: folder NAME, then uploaded.")],
+    snapshot: SnapshotOption = None,
+    licence: LicenceOption = "",
+    text: OriginOption = "",
+    assets: AssetsOption = None,
+    accept: Annotated[
+        bool, typer.Option("--accept-unknown-licences", help="Publish without some licences; the card names them.")
+    ] = False,
+    every: EveryOption = False,
+    held_out: Annotated[float, typer.Option(min=0, max=0.9, help="Share of objects in split test; 0: no split.")] = 0.2,
+    tars: Annotated[
+        bool, typer.Option("--webdataset/--no-webdataset", help="Write the pictures as tar files, too.")
+    ] = True,
+    public: Annotated[bool, typer.Option("--public", help="Make a new repository public; default: private.")] = False,
+    data_dir: DataDir = None,
+    json: JsonFlag = False,
+) -> None:
+    """Write a dataset for a hub: Parquet, WebDataset, card, Croissant, licences, checksums; upload it.
+
+    The folder appears when it is complete. The same command continues an interrupted one.
+    """
+    from graspd.studies.publication import Hub, PublicationOptions
+    from graspd.studies.publication import publish as write_publication
+
+    hub = Hub(to.removeprefix("hf://")) if to.startswith("hf://") else None
+    folder = Path(hub.repository.split("/")[1] if hub else to)
+    contents = _contents(source, snapshot, assets, data_dir)
+    options = PublicationOptions(licence, text, every, held_out, tars, accept)
+    with _progress(json=json) as report:
+        write_publication(contents, folder, options, report, name=hub.repository if hub else "")
+    address = hub.upload(folder, public=public) if hub else ""
+    files = sorted(str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file())
+    told = {"folder": str(folder), "dataset": contents.name, "files": files, "uploaded": address}
+    print_result(told, f"{folder}: {len(files)} files" + (f", uploaded: {address}" if address else ""), json=json)
+
+
+def _contents(source: str, snapshot: str | None, assets: Path | None, data_dir: Path | None) -> Contents:
     from graspd.studies.cards.contents import add_provenance, contents_of_folder, contents_of_store
 
     if "/" in source or source in (".", ".."):
@@ -257,17 +314,14 @@ def card(
     else:
         store = open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False)
         contents = contents_of_store(store, source, snapshot)
-    if assets is not None:
-        contents = add_provenance(contents, assets)
-    columns = (TextColumn("shards"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return contents if assets is None else add_provenance(contents, assets)
+
+
+@contextmanager
+def _progress(*, json: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """Show the current step with its finished and all parts."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     console = plain_console(stderr=True)
     with Progress(*columns, console=console, disable=json or not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("", total=len(contents.shards))
-        found = write_card(
-            contents, out, licence=licence, source=text, progress=lambda done, _: bar.update(task, completed=done)
-        )
-    made = found["composition"]
-    told = {"out": str(out), "dataset": found["name"], "snapshot": (found["snapshot"] or {}).get("digest")}
-    told |= {"grasps": made["grasps"], "valid": made["valid"], "pictures": made["pictures"], "plots": found["plots"]}
-    line = f"{out}/README.md: {made['valid']:,} valid grasps, {len(found['plots'])} plots, checksums, card.json"
-    print_result(told, line, json=json)
+        task = bar.add_task("")
+        yield lambda step, done, total: bar.update(task, description=step, completed=done, total=total)

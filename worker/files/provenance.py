@@ -23,7 +23,7 @@ from graspd.service.store.assets import builtin_files, builtin_names
 from graspd.service.store.columns import Attribute
 from graspd.service.store.library import load_asset_files
 from graspd.service.store.shards import Shard, json_attribute
-from graspd.service.store.store import open_store
+from graspd.service.store.store import Store, open_store
 from graspd.service.store.usd_layers import SUFFIXES as USD
 from graspd.worker.grasps import Columns
 from graspd.worker.hands.load import files_from_path as hand_files
@@ -72,8 +72,9 @@ def path_attributes(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str
     return found | ({"object_options": json_attribute(dict(options))} if options else {})
 
 
-def find_files(sought: AssetReference) -> AssetFiles:
+def find_files(sought: AssetReference, store: Store | None = None) -> AssetFiles:
     """Find the files of a hand or object: built in, at the recorded path, in the store, near the shard.
+    The store is by default that of the settings.
     Raises NotFoundError: they are in none of these places; the message lists the places."""
     if sought.name in builtin_names(sought.kind):
         files = builtin_files(sought.kind, sought.name)
@@ -84,7 +85,7 @@ def find_files(sought: AssetReference) -> AssetFiles:
         looked.append(f"at {sought.source}, where the shard was made")
         if (found := files_at(sought, Path(sought.source))) is not None:
             return found
-    if (found := _files_in_store(sought, looked)) is not None:
+    if (found := _files_in_store(sought, looked, store)) is not None:
         return found
     for path in _nearby_paths(sought, looked):
         if (found := files_at(sought, path)) is not None:
@@ -95,13 +96,13 @@ def find_files(sought: AssetReference) -> AssetFiles:
     )
 
 
-def _files_in_store(sought: AssetReference, looked: list[str]) -> AssetFiles | None:
+def _files_in_store(sought: AssetReference, looked: list[str], store: Store | None) -> AssetFiles | None:
     from graspd.service.settings import Settings
 
-    url = Settings().resolved_store_url
+    url = store.url if store else Settings().resolved_store_url
     looked.append(f"in the store {url}")
     try:
-        return AssetFiles(load_asset_files(open_store(url, make=False), sought.kind, sought.digest), {})
+        return AssetFiles(load_asset_files(store or open_store(url, make=False), sought.kind, sought.digest), {})
     except GraspdError:
         return None
 
@@ -164,7 +165,7 @@ def hand_files_of_shard(shard: Shard, given: str | None) -> AssetFiles:
     return find_files(_reference_of(shard, AssetKind.HAND))
 
 
-def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
+def object_of_shard(shard: Shard, given: str | None, store: Store | None = None) -> ObjectModel:
     """Load the object `given`, with the shard's simplification, mass and friction; see `hand_of_shard`."""
     said = shard.attributes
     # Older shards lack these attributes: the values were the same for all objects.
@@ -173,7 +174,7 @@ def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
     error = float(stated) if isinstance(stated, int | float) else 3e-4
     wanted = _reference_of(shard, AssetKind.OBJECT)
     if not given:
-        obj = _load_object(wanted, find_files(wanted), error)
+        obj = _load_object(wanted, find_files(wanted, store), error)
     elif (found := files_at(wanted, Path(given))) is not None:
         obj = _load_object(wanted, found, error)
     else:
