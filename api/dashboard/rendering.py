@@ -53,7 +53,7 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
     defaults = {"page": "", "events": "", "refresh_s": 0, "poll_s": 0, "health": request.app.state.overview.health()}
     context = defaults | context
     may_read = is_allowed(request, Scope.READ)
-    has_bell = may_read and context["health"] is not None and context["health"].parts["index"].ok
+    has_bell = may_read and context["health"] is not None and context["health"].parts["index"].latency_ms is not None
     ends = request.app.state.webhooks.own_ends(seen_end(request), limit=MOST_UNREAD) if has_bell else []
     context |= {
         "template": template,

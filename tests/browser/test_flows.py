@@ -234,6 +234,11 @@ def test_every_part_of_the_dashboard_works_below_the_path(page: Any, services: S
     page.wait_for_url(f"**{PREFIX}/jobs/*")
     page.click("button:has-text('Cancel')")
     page.wait_for_selector("#head .cancelled")
+    page.wait_for_selector(".toast:has-text('The job is cancelled')")
+    page.click("#bell:has-text('2')")
+    page.wait_for_url(f"**{PREFIX}/notifications")
+    page.goto(f"{address}/engine")
+    assert page.locator(".toast, #bell span").count() == 0, "both are seen: the cookies are below the path, too"
 
     page.goto(f"{address}/submit")
     block = builtin_files(AssetKind.OBJECT, "block")["block.stl"]

@@ -165,9 +165,9 @@ def test_pages_are_read_without_redis(http: TestClient, services: Services, monk
         ({}, r"About .* on one worker \(.* to .*\) for 32 valid grasps from \d+ candidates"),
         ({"mass": "0.4", "min_payload": "0.5"}, r"About .* on one worker"),
         ({"validation": "none", "grasps": "64"}, r"for 64 feasible grasps from"),
-        ({"grasps": "0"}, "No estimate for these values"),
-        ({"fidelity": "auto", "target": "gsr>=0.6"}, "No estimate for these values"),
-        ({"options": "steps"}, "No estimate for these values"),
+        ({"grasps": "0"}, "No estimate until all values are valid"),
+        ({"fidelity": "auto", "target": "gsr>=0.6"}, "No estimate until all values are valid"),
+        ({"options": "steps"}, "No estimate until all values are valid"),
     ],
 )
 def test_the_form_estimates_its_cost_in_a_sentence(http: TestClient, said: dict[str, str], words: str) -> None:
