@@ -101,6 +101,7 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
     "bytes": size,
     "stamp": stamp,
     "shell": shlex.quote,
+    "python": repr,
 }
 
 

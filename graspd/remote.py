@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Self, Unpack
+from typing import TYPE_CHECKING, Any, Self, Unpack
 
 from graspd.grasps import Grasps, concatenate
 from graspd.service.model.domain import JobOptions, JobRequest
@@ -64,6 +64,18 @@ class Client:
         """
         request = validate(JobRequest, {"hand": hand, "object": object, **options})
         return Job(self._http, self._http.submit(request))
+
+    def get(self, path: str, **query: Any) -> Any:
+        """Return the JSON of a GET route, such as `get("jobs", state="failed")["items"]`.
+
+        Args:
+            path: address below /v1.
+            query: parameters of the route; `cursor`, the field `next` of a list, requests the next items.
+
+        Raises:
+            NotFoundError: there is no such resource.
+        """
+        return self._http.send("GET", f"/v1/{path}", params=query).json()
 
     def job(self, job_id: str) -> Job:
         """Return a job by its id.

@@ -41,6 +41,9 @@ class Settings(BaseSettings):
     index_url: SecretStr | None = Field(None, description="SQLAlchemy URL of the index; unset: SQLite in data_dir")
     host: str = Field("127.0.0.1", description="address to which the API binds")
     port: int = Field(8000, ge=0, le=65535, description="port to which the API binds; 0: any free port")
+    docs_url: str | None = Field(
+        None, pattern="^https?://", description="address of the documentation, linked in the footer of the dashboard"
+    )
     api_root_path: str | None = Field(
         None, description="path under which a proxy serves the API and the dashboard, such as /graspd; unset: the root"
     )

@@ -21,7 +21,7 @@ METRIC = metrics.GraspMetric(
 OPTION, FLAG = "finger_force", "--finger-force"
 ROW = f"""
     {OPTION}: Annotated[
-        float, Option(), FormField("grasps", "Finger force", "of each finger", cells=True)
+        float, Option(), FormField("Grasp", "Finger force", "of each finger", cells=True)
     ] = _sparse_field(5.0, ge=1, le=20, description="{MEANING} [N]")
 """
 #: The row stands before the first rule of the table.

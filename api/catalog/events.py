@@ -90,6 +90,9 @@ class Webhooks:
     def end_events(self, since: int, *, limit: int) -> list[EndView]:
         return self._services.index.outbox.end_events(since, limit=limit, scope=project_scope())
 
+    def own_ends(self, since: int, *, limit: int) -> list[tuple[EndView, str]]:
+        return self._services.index.outbox.own_ends(caller_id(), since, limit=limit, scope=project_scope())
+
     def add(self, url: str, states: tuple[End, ...]) -> tuple[WebhookView, str]:
         """Add a webhook; return it with its secret, which cannot be shown again."""
         master = self._services.settings.webhook_secret

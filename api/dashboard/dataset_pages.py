@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Final
-from urllib.parse import urlencode
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
@@ -18,7 +17,7 @@ from graspd.api.dashboard.figures import paired_bars
 from graspd.api.dashboard.form_uploads import asset_choices
 from graspd.api.dashboard.forms import fields_of, first_message, inputs_of, split_list
 from graspd.api.dashboard.grasp_pages import COLUMNS
-from graspd.api.dashboard.rendering import render
+from graspd.api.dashboard.rendering import redirect, render
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, DatasetsOf, JobsOf
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import ConflictError, InputError
@@ -31,7 +30,7 @@ PAGE_SIZE: Final = 20
 MATRIX_CELLS: Final = 1000
 _CELLS_AT_ONCE: Final = 200
 Fields = Annotated[FormData, fields_of(4000)]
-_DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled", "snapshot": "taken as a snapshot"}
+_DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled"}
 
 _INPUTS: Final = inputs_of(cells=True)
 _MAKE: Final = {"name": "", "grasps": "320", "fidelity": "standard"} | {one.name: one.default for one in _INPUTS}
@@ -58,7 +57,7 @@ def create(request: Request, datasets: DatasetsOf, assets: AssetsOf, fields: Fie
         dataset = datasets.create(DatasetRequest.model_validate(wanted | {"neighbours": neighbours}))
     except (ValidationError, InputError) as error:
         return _render_datasets(request, datasets, assets, problem=first_message(error), form=wanted, status=422)
-    return RedirectResponse(f"/datasets/{dataset.name}", status_code=303)
+    return redirect(f"/datasets/{dataset.name}", f"The dataset {dataset.name} is made; its jobs start now.")
 
 
 @router.post("/cells", dependencies=SUBMIT, response_model=None)
@@ -76,7 +75,7 @@ def act_on_pairs(
             done, left = _apply_to_each(_job_action(jobs, action), _jobs_of(jobs, pairs, action))
     except (ValidationError, InputError) as error:
         return _render_datasets(request, datasets, assets, problem=first_message(error), status=422)
-    return _redirect("/datasets", action, done=done, left=left)
+    return redirect("/datasets", _summary(action, done, left))
 
 
 @router.get("/{name}", dependencies=READ)
@@ -104,7 +103,6 @@ def dataset_page(
         chosen=chosen or "",
         next=page.next if page else None,
         snapshots=datasets.snapshots(name, limit=10).items,
-        did=_action_summary(request),
     )
 
 
@@ -112,17 +110,21 @@ def dataset_page(
 def act_on_cells(name: str, jobs: JobsOf, fields: Fields) -> RedirectResponse:
     action = str(fields.get("action", ""))
     done, left = _apply_to_each(_job_action(jobs, action), [str(cell) for cell in fields.getlist("cell")])
-    return _redirect(f"/datasets/{name}", action, done=done, left=left)
+    return redirect(f"/datasets/{name}", _summary(action, done, left))
 
 
 @router.post("/{name}/{action}", dependencies=SUBMIT)
 def act(name: str, action: str, datasets: DatasetsOf) -> RedirectResponse:
-    do: dict[str, Callable[[str], Any]]
-    do = {"cancel": datasets.cancel, "retry": datasets.retry, "snapshot": datasets.take_snapshot}
+    do: dict[str, tuple[Callable[[str], Any], str]] = {
+        "cancel": (datasets.cancel, "The dataset is cancelled; finished grasps remain."),
+        "retry": (datasets.retry, "Failed and cancelled jobs of the dataset run again."),
+        "snapshot": (datasets.take_snapshot, "The snapshot is taken; it lists all shards made so far."),
+    }
     if action not in do:
         raise InputError(f"a dataset has no action {action!r}; there are: {', '.join(do)}")
-    do[action](name)
-    return _redirect(f"/datasets/{name}", action, done=1)
+    act, said = do[action]
+    act(name)
+    return redirect(f"/datasets/{name}", said)
 
 
 def _job_action(jobs: Jobs, action: str) -> Callable[[str], Any]:
@@ -154,20 +156,9 @@ def _apply_to_each(do: Callable[[Any], Any], wanted: Iterable[Any]) -> tuple[int
     return done, left
 
 
-def _redirect(address: str, action: str, *, done: int, left: int = 0) -> RedirectResponse:
-    return RedirectResponse(f"{address}?{urlencode({'did': action, 'done': done, 'left': left})}", status_code=303)
-
-
-def _action_summary(request: Request) -> str:
-    given = request.query_params
-    done, left = given.get("done", ""), given.get("left", "0")
-    if given.get("did") not in _DONE or not done.isdigit() or not left.isdigit():
-        return ""
-    if given["did"] == "snapshot":
-        return "The snapshot is taken; it lists all shards made so far."
-    what = "job" if done == "1" else "jobs"
-    unchanged = f"; {left} unchanged: owned by another key, or not in a suitable state" if left != "0" else ""
-    return f"{done} {what} {_DONE[given['did']]}{unchanged}."
+def _summary(action: str, done: int, left: int) -> str:
+    unchanged = f"; {left} unchanged: owned by another key, or not in a suitable state" if left else ""
+    return f"{done} {'job' if done == 1 else 'jobs'} {_DONE[action]}{unchanged}."
 
 
 def _render_datasets(
@@ -198,7 +189,6 @@ def _render_datasets(
         inputs=_INPUTS,
         form=_MAKE | {"hands": [], "objects": []} | (form or {}),
         problem=problem,
-        did=_action_summary(request),
     )
 
 

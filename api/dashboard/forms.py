@@ -1,12 +1,12 @@
-"""Form of a job without JavaScript, and submission, cancellation and retry of jobs.
-
-The form has the estimated cost of the job."""
+"""Form of a job with its estimated cost, and submission, cancellation and retry of jobs."""
 
 from __future__ import annotations
 
+import shlex
 import threading
 import time
 from collections.abc import AsyncIterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -20,14 +20,15 @@ from graspd.api.access.auth import project_scope
 from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, AssetChoice, choose_asset, refusal_of, select_choices
-from graspd.api.dashboard.rendering import render
+from graspd.api.dashboard.rendering import redirect, render
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, JobsOf
+from graspd.service.command_options import parse_pairs
 from graspd.service.index.index import Index
 from graspd.service.index.queries.overview import BatchCost
 from graspd.service.model.base import first_error, problem_text
+from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import GraspdError, InputError
-from graspd.service.model.fidelity import OFFERED
 from graspd.service.model.options import FormField, OptionRow, option_rows
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.states import AssetKind, Stage
@@ -57,6 +58,9 @@ class FormInput:
     choices: Mapping[str, str]
     default: Any
     attributes: Mapping[str, Any]
+    group: str
+    many: bool
+    """Whether the text is a list, separated by commas or spaces."""
 
     @classmethod
     def from_row(cls, row: OptionRow, form: FormField) -> FormInput:
@@ -69,21 +73,22 @@ class FormInput:
             limits |= {"step": "any"} if row.kind is float else {}
         elif form.placeholder:
             limits = {"maxlength": 600, "placeholder": form.placeholder}
-        default = "" if row.default in (None, ()) else f"{row.default:g}" if row.kind is float else row.default
+        default: Any = row.default if row.default or kind == "number" else "" if kind == "text" else False
+        default = "" if default is None else f"{default:g}" if row.kind is float else default
         label = f"{form.label} [{row.unit}]" if row.unit else form.label
-        return cls(row.name, label, form.hint, kind, form.choices, default, limits)
+        usual = f"default {form.choices.get(default, default)}" if default != "" and kind != "checkbox" else ""
+        hint = "; ".join(filter(None, (form.hint, usual)))
+        return cls(row.name, label, hint, kind, form.choices, default, limits, form.group, row.kind == list[str])
 
 
-def inputs_of(section: str = "", *, cells: bool = False) -> list[FormInput]:
-    """Return the fields of a job's form, or of a dataset's with `cells`; an empty section means all."""
-    return [
-        FormInput.from_row(row, form)
-        for row in option_rows(JobOptions, "job")
-        if (form := row.form) and section in ("", form.section) and (form.cells or not cells)
-    ]
+def inputs_of(*, cells: bool = False) -> list[FormInput]:
+    """Return the fields of a job's form, or of a dataset's with `cells`."""
+    rows = [(row, row.form) for row in option_rows(JobOptions, "job")]
+    return [FormInput.from_row(row, form) for row, form in rows if form and (form.cells or not cells)]
 
 
-DEFAULTS: Final = {"hand": "allegro", "object": "mug"} | {one.name: one.default for one in inputs_of()}
+INPUTS: Final = inputs_of()
+DEFAULTS: Final = {"hand": "allegro", "object": "mug"} | {one.name: one.default for one in INPUTS}
 
 
 @router.get("/submit", dependencies=READ)
@@ -100,7 +105,7 @@ def refusal_page(request: Request, kind: AssetKind, digest: str, assets: AssetsO
 
 @router.post("/submit", dependencies=SUBMIT, response_model=None)
 async def submit(request: Request, jobs: JobsOf, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
-    async with request.form(max_files=2, max_fields=32) as fields:
+    async with request.form(max_files=2, max_fields=64) as fields:
         sent = any(isinstance(value, UploadFile) and value.filename for value in fields.values())
         # A refused file that the form refers to is read and checked like an upload.
         has_upload = sent or any(fields.get(f"{kind.value}_held") for kind in FILE_FIELDS)
@@ -111,13 +116,13 @@ async def submit(request: Request, jobs: JobsOf, assets: AssetsOf) -> HTMLRespon
 @router.post("/jobs/{job_id}/cancel", dependencies=SUBMIT)
 def cancel(job_id: str, jobs: JobsOf) -> RedirectResponse:
     jobs.cancel(job_id)
-    return RedirectResponse(f"/jobs/{job_id}", status_code=303)
+    return redirect(f"/jobs/{job_id}", "The job is cancelled; finished grasps remain.")
 
 
 @router.post("/jobs/{job_id}/retry", dependencies=SUBMIT)
 def retry(job_id: str, jobs: JobsOf) -> RedirectResponse:
     jobs.retry(job_id)
-    return RedirectResponse(f"/jobs/{job_id}", status_code=303)
+    return redirect(f"/jobs/{job_id}", "Failed and cancelled tasks of the job run again.")
 
 
 def first_message(error: Exception) -> str:
@@ -127,7 +132,7 @@ def first_message(error: Exception) -> str:
 def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> HTMLResponse | RedirectResponse:
     names = [name for name in DEFAULTS if name not in ("hand", "object")]
     form: dict[str, Any] = {name: fields[name] for name in names if isinstance(fields.get(name), str) and fields[name]}
-    form |= {one.name: fields.get(one.name) == "true" for one in inputs_of() if one.kind == "checkbox"}
+    form |= {one.name: fields.get(one.name) == "true" for one in INPUTS if one.kind == "checkbox"}
     things = {kind: choose_asset(request, assets, fields, kind) for kind in FILE_FIELDS}
     form |= {kind.value: one.name for kind, one in things.items()}
     shown = DEFAULTS | form | {"units": fields.get("units") or "m"}
@@ -135,19 +140,34 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
     if any(fields.get(f"{kind.value}_fix") for kind in FILE_FIELDS):
         # The button of a fix only shows its result; the submit button submits.
         return _render_form(request, assets, shown, things=things, errors=refused, status=422 if refused else 200)
+    started = timestamp()
     try:
         named = {kind.value: one.name or "unnamed" for kind, one in things.items()}
-        body = JobRequest.model_validate(form | named | {"neighbours": split_list(str(form.get("neighbours", "")))})
+        body = JobRequest.model_validate(parse_lists(form) | named)
+        if refused:
+            return _render_form(request, assets, shown, things=things, errors=refused, status=422)
+        job = jobs.submit(body)
     except ValidationError as error:
         return _render_form(request, assets, shown, things=things, errors=refused | _errors_by_field(error), status=422)
-    if refused:
-        return _render_form(request, assets, shown, things=things, errors=refused, status=422)
-    try:
-        job = jobs.submit(body)
     except InputError as error:
         problem = {"title": error.title, "detail": str(error)}
         return _render_form(request, assets, shown, things=things, problem=problem, status=error.status)
-    return RedirectResponse(f"/jobs/{job.id}", status_code=303)
+    said = "The same job existed already; this is its page." if job.created < started else "The job is submitted."
+    return redirect(f"/jobs/{job.id}", said)
+
+
+def _snippet(form: dict[str, Any]) -> tuple[str, str]:
+    """Return the call of `graspd.Client` and the command that submit a form's job; only valid options are in them."""
+    words = [str(form["hand"]), str(form["object"])]
+    calls, command = [repr(word) for word in words], ["graspd", "submit", "--hand", words[0], "--object", words[1]]
+    with suppress(ValueError, GraspdError):
+        request = JobRequest.model_validate(parse_lists(form)).model_dump(mode="json", exclude_defaults=True)
+        for row in option_rows(JobOptions, "job"):
+            if row.name in request and (typed := str(form[row.name])) != str(DEFAULTS[row.name]):
+                calls.append(f"{row.name}={request[row.name]!r}")
+                values = split_list(typed) if row.kind == list[str] else [typed]
+                command += [part for one in values for part in (row.flags[0], one)[: 1 if row.kind is bool else 2]]
+    return f"client.submit({', '.join(calls)})", shlex.join(command)
 
 
 def _errors_by_field(error: ValidationError) -> dict[str, str]:
@@ -178,30 +198,36 @@ def _render_form(
         status=status,
         page="/submit",
         form={"units": "m"} | form,
-        errors=dict.fromkeys([*DEFAULTS, "file", "hand_file"], "") | (errors or {}),
+        errors=(errors := dict.fromkeys([*DEFAULTS, "file", "hand_file"], "") | (errors or {})),
         problem=problem,
-        sections={section: inputs_of(section) for section in ("grasps", "scenes")},
+        groups={
+            title: [one for one in INPUTS if one.group == title] for title in dict.fromkeys(one.group for one in INPUTS)
+        },
+        opened=any(errors[one.name] or str(form[one.name]) != str(one.default) for one in INPUTS if one.group),
         hands=select_choices(assets, AssetKind.HAND, str(form["hand"]), things[AssetKind.HAND]),
         objects=select_choices(assets, AssetKind.OBJECT, str(form["object"]), things[AssetKind.OBJECT]),
         held={kind.value: one.held for kind, one in things.items()},
         fixes={kind.value: one.refused.fixes if one.refused else () for kind, one in things.items()},
-        expected=request.app.state.expectations.by_fidelity(form),
+        cost=request.app.state.expectations.estimate(form),
         units=UNITS,
+        snippet=_snippet(form),
         max_upload=request.app.state.settings.max_upload_bytes,
     )
 
 
 #: Cache lifetime of the costs of batches [s].
 KEPT_S: Final = 60.0
-WORDS: Final = {
-    "draft": "Fewest points and starts, for a first look.",
-    "standard": "Balance of speed and accuracy; default.",
-    "fine": "More points and starts, more accurate contacts.",
-}
 
 
 def split_list(text: str) -> list[str]:
     return text.replace(",", " ").split()
+
+
+def parse_lists(form: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a form without empty fields, with lists parsed; InputError for a planner's option without a value."""
+    found = {one.name: split_list(str(form.get(one.name, ""))) for one in INPUTS if one.many}
+    form = {name: value for name, value in form.items() if value != ""}
+    return {**form, **found, "options": parse_pairs(found["options"])}
 
 
 class FormEstimates:
@@ -212,17 +238,13 @@ class FormEstimates:
         self._read: dict[tuple[Stage, ProjectScope], tuple[float, list[BatchCost]]] = {}
         self._lock = threading.Lock()
 
-    def by_fidelity(self, form: Mapping[str, Any]) -> list[tuple[str, str, Estimate | None]]:
-        """Return each offered fidelity, its description, and its estimate for a form; None if unknown."""
-        wanted = {key: value for key, value in form.items() if key not in ("hand", "object") and value != ""}
-        wanted["neighbours"] = split_list(str(form.get("neighbours", "")))
-        wanted |= {"hands": (str(form["hand"]),), "objects": (str(form["object"]),)}
-        return [(name, WORDS[name], self._estimate(wanted | {"fidelity": name})) for name in OFFERED]
-
-    def _estimate(self, wanted: dict[str, Any]) -> Estimate | None:
+    def estimate(self, form: Mapping[str, Any]) -> Estimate | None:
+        """Return the estimate for a form; None while its values are invalid, or its fidelity is `auto`."""
+        wanted = {key: value for key, value in form.items() if key not in ("hand", "object")}
         try:
+            wanted = parse_lists(wanted) | {"hands": (str(form["hand"]),), "objects": (str(form["object"]),)}
             return estimate(self._index, Matrix.model_validate(wanted), costs=self._costs, scope=project_scope())
-        except (ValidationError, GraspdError):
+        except (ValueError, GraspdError):
             return None
 
     def _costs(self, stage: Stage) -> list[BatchCost]:

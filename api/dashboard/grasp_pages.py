@@ -12,9 +12,8 @@ from starlette.datastructures import FormData
 
 from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.tags import Format, Tags
-from graspd.api.dashboard import rendering
 from graspd.api.dashboard.forms import fields_of, first_message
-from graspd.api.dashboard.rendering import base_url, render
+from graspd.api.dashboard.rendering import render
 from graspd.api.models import GraspName, GraspQuery, Selection
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, ExportsOf, GraspsOf, ShardsOf, TagsOf, next_address
 from graspd.api.routes.grasps import export_response
@@ -113,7 +112,6 @@ def grasp_page(
         type=GraspType(int(grasp.grasp_type or 0)),
         weakest=_WEAKEST.get(grasp.robust_weakest or ""),
         swept=[metric for metric in GRASP_METRICS if metric.name in grasp.sweep],
-        loader=rendering.grasp_loader_code(grasp, base_url(request)),
     )
 
 

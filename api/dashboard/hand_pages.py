@@ -9,7 +9,7 @@ from starlette.datastructures import FormData
 
 from graspd.api.catalog.assets import Assets
 from graspd.api.dashboard.forms import first_message
-from graspd.api.dashboard.rendering import render
+from graspd.api.dashboard.rendering import redirect, render
 from graspd.api.routes.assets import CorrectionRequest, store_correction
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf
 from graspd.service.index.views import AssetView
@@ -72,7 +72,7 @@ def _correct(request: Request, assets: Assets, name: str, fields: FormData) -> H
         made = store_correction(assets, hand.digest, said, said.name)
     except (InputError, ConflictError, ValueError) as error:
         return _render_hand(request, hand, facts, problem=first_message(error), form=shown, status=422)
-    return RedirectResponse(f"/hands/{made.digest}", status_code=303)
+    return redirect(f"/hands/{made.digest}", f"The hand {made.name} is saved; a worker checks it.")
 
 
 def _render_hand(

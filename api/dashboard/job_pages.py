@@ -11,9 +11,9 @@ from fastapi.responses import HTMLResponse
 from numpy.typing import NDArray
 from PIL import Image
 
-from graspd.api.dashboard import figures, rendering
+from graspd.api.dashboard import figures
 from graspd.api.dashboard.grasp_pages import COLUMNS, action_summary, tag_choices
-from graspd.api.dashboard.rendering import base_url, render
+from graspd.api.dashboard.rendering import render
 from graspd.api.models import GraspQuery, JobDetail
 from graspd.api.routes.dependencies import READ, GraspsOf, JobsOf, ShardsOf, TagsOf
 from graspd.service.model.errors import NotFoundError
@@ -58,8 +58,6 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         columns=COLUMNS,
         sort="epsilon",
         shards=job.shards,
-        loader=rendering.job_loader_code(job, base_url(request)),
-        curl=rendering.curl_commands(job, base_url(request)),
     )
 
 

@@ -10,20 +10,23 @@ from fastapi import APIRouter, FastAPI, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from graspd.api.access.auth import SESSION_COOKIE
-from graspd.api.access.keys import SESSION_S, KeyFile
+from graspd.api.access.auth import SESSION_COOKIE, is_allowed
+from graspd.api.access.keys import SESSION_S, KeyFile, Scope
 from graspd.api.catalog import events
+from graspd.api.catalog.events import Webhooks
 from graspd.api.catalog.overview import MINUTES, Overview
 from graspd.api.dashboard import dataset_pages, figures, forms, grasp_pages, hand_pages, job_pages, tradeoff
 from graspd.api.dashboard.forms import FormEstimates
 from graspd.api.dashboard.job_pages import ShardPictures
-from graspd.api.dashboard.rendering import environment, render
+from graspd.api.dashboard.rendering import SEEN, environment, redirect, render, seen_end
 from graspd.api.models import STAGE_LABELS
 from graspd.api.routes import dependencies
 from graspd.api.routes.system import Since, Until
 from graspd.service.index.views import WorkerView
+from graspd.service.model.domain import METHODS
 from graspd.service.model.errors import ERRORS, InputError, UnavailableError
 from graspd.service.model.states import State
+from graspd.service.model.webhooks import MAX_URL, End
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.records import What
 
@@ -68,8 +71,9 @@ def home(
 
 
 @router.get("/workers", dependencies=dependencies.READ)
-def workers_page(request: Request, overview: dependencies.OverviewOf) -> HTMLResponse:
+def workers_page(request: Request, overview: dependencies.OverviewOf, jobs: dependencies.JobsOf) -> HTMLResponse:
     workers = [worker for worker in overview.workers() if is_recent(worker)]
+    tasks = {worker.name: task for worker in workers if (task := overview.task_of(worker)) is not None}
     return render(
         request,
         "workers.html",
@@ -77,7 +81,8 @@ def workers_page(request: Request, overview: dependencies.OverviewOf) -> HTMLRes
         events="/events",
         refresh_s=5,
         workers=workers,
-        tasks={worker.name: task for worker in workers if (task := overview.task_of(worker)) is not None},
+        tasks=tasks,
+        jobs={job_id: jobs.get_progress(job_id) for job_id in {task.job_id for task in tasks.values()}},
         busy=sum(worker.state == "busy" for worker in workers),
         alive=sum(worker.state != "lost" for worker in workers),
         stages=stage_depths(overview),
@@ -95,7 +100,7 @@ def chart_page(
     return render(
         request,
         "chart.html",
-        page="/chart",
+        page="/engine",
         poll_s=_STUDY_S,
         charts=list(zip(measured, drawn, strict=True)),
         # For each kind of chart: title, name in the URL, accuracies, and the selected accuracy.
@@ -118,7 +123,67 @@ def chart_page(
 def stability_page(request: Request, store: dependencies.StoreOf) -> HTMLResponse:
     measured = figures.load_stability(store)
     maps = [figures.draw_map(one) for one in measured.maps] if measured else []
-    return render(request, "stability.html", page="/stability", poll_s=_STUDY_S, measured=measured, maps=maps)
+    return render(request, "stability.html", page="/engine", poll_s=_STUDY_S, measured=measured, maps=maps)
+
+
+@router.get("/engine", dependencies=dependencies.READ)
+def engine_page(request: Request, store: dependencies.StoreOf, overview: dependencies.OverviewOf) -> HTMLResponse:
+    workers = [worker for worker in overview.workers() if worker.state != "lost"]
+    return render(
+        request,
+        "engine.html",
+        page="/engine",
+        methods=METHODS,
+        devices=sorted({(one.device_name or one.device, one.version) for one in workers}),
+        charts=tradeoff.load_charts(store),
+        maps=figures.load_stability(store),
+    )
+
+
+@router.get("/notifications", dependencies=dependencies.READ)
+def notifications_page(request: Request, webhooks: dependencies.WebhooksOf) -> HTMLResponse:
+    return _render_notifications(request, webhooks)
+
+
+@router.post("/notifications", dependencies=dependencies.SUBMIT)
+def add_webhook(
+    request: Request,
+    webhooks: dependencies.WebhooksOf,
+    url: Annotated[str, Form(max_length=MAX_URL)],
+    states: Annotated[list[End] | None, Form()] = None,
+) -> HTMLResponse:
+    try:
+        if not states:
+            raise InputError("choose at least one state")
+        return _render_notifications(request, webhooks, secret=webhooks.add(url, tuple(states))[1])
+    except InputError as error:
+        return _render_notifications(request, webhooks, problem=str(error), url=url, status=error.status)
+
+
+@router.post("/notifications/{webhook_id}/delete", dependencies=dependencies.SUBMIT)
+def delete_webhook(webhook_id: str, webhooks: dependencies.WebhooksOf) -> RedirectResponse:
+    webhooks.delete(webhook_id)
+    return redirect("/notifications", "The webhook is deleted.")
+
+
+def _render_notifications(request: Request, webhooks: Webhooks, *, status: int = 200, **shown: str) -> HTMLResponse:
+    """Show the visitor's ended jobs and datasets, which counts as seen, and the webhooks it may change."""
+    ends = webhooks.own_ends(0, limit=PAGE_SIZE)
+    hooks = webhooks.all() if is_allowed(request, Scope.SUBMIT) else []
+    page = render(
+        request,
+        "notifications.html",
+        page="/notifications",
+        status=status,
+        **{"problem": "", "url": "", "secret": ""} | shown,
+        ends=ends,
+        seen=seen_end(request),
+        hooks=[(hook, webhooks.deliveries(hook.id, limit=1)) for hook in hooks],
+        is_on=request.app.state.settings.webhook_secret is not None,
+    )
+    if ends:
+        page.set_cookie(SEEN, str(ends[0][0].seq), max_age=SESSION_S, httponly=True, samesite="strict")
+    return page
 
 
 def is_recent(worker: WorkerView) -> bool:
@@ -184,7 +249,8 @@ def deleted_page(request: Request, deletions: dependencies.DeletionsOf, done: st
 def restore(what: What, name: str, deletions: dependencies.DeletionsOf) -> RedirectResponse:
     found = deletions.restore(what, name)
     pages = {"job": f"/jobs/{found.id}", "dataset": f"/datasets/{found.id}", "hand": f"/hands/{found.name}"}
-    return RedirectResponse(pages.get(what, "/grasps" if what == "tag" else "/deleted"), status_code=303)
+    where = pages.get(what, "/grasps" if what == "tag" else "/deleted")
+    return redirect(where, f"The {what} {found.name} is restored.")
 
 
 @router.post("/datasets/{name}/delete", dependencies=dependencies.SUBMIT)

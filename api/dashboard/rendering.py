@@ -1,7 +1,9 @@
-"""Rendering of templates, and code snippets that load a job's files."""
+"""Rendering of templates, and redirects with a message."""
 
+import time
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import quote, unquote
 
 from fastapi import Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
@@ -11,7 +13,6 @@ from graspd.api import formatting
 from graspd.api.access.auth import is_allowed, may_change
 from graspd.api.access.keys import Scope
 from graspd.api.middleware.request_context import add_prefix
-from graspd.api.models import GraspDetail, JobDetail
 from graspd.service.model.version import PACKAGE_VERSION
 
 _HERE: Final = Path(__file__).parent
@@ -22,11 +23,16 @@ NAVIGATION: Final = (
     ("/grasps", "Grasps"),
     ("/hands", "Hands"),
     ("/workers", "Workers"),
-    ("/chart", "Chart"),
-    ("/stability", "Stability"),
+    ("/usage", "Usage"),
+    ("/engine", "Engine"),
 )
-#: Pages shown only if requests need a key: usage belongs to the projects of keys.
-_WITH_KEYS: Final = (("/usage", "Usage"),)
+#: Cookie with a message for the next page.
+_TOAST: Final = "graspd_toast"
+#: Parameters of pages that the API does not have.
+_NO_FILTERS: Final = ("view", "cursor", "did", "done", "named")
+#: Cookie with the number of the last end of a job or dataset that the visitor has seen.
+SEEN: Final = "graspd_seen"
+MOST_UNREAD: Final = 100
 
 
 def environment() -> Environment:
@@ -46,8 +52,18 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
     """Render a page; `page` is its navigation entry, `events` its update stream, `poll_s` an interval [s]."""
     defaults = {"page": "", "events": "", "refresh_s": 0, "poll_s": 0, "health": request.app.state.overview.health()}
     context = defaults | context
+    may_read = is_allowed(request, Scope.READ)
+    has_bell = may_read and context["health"] is not None and context["health"].parts["index"].latency_ms is not None
+    ends = request.app.state.webhooks.own_ends(seen_end(request), limit=MOST_UNREAD) if has_bell else []
     context |= {
-        "navigation": NAVIGATION if request.app.state.keys.is_open else NAVIGATION + _WITH_KEYS,
+        "template": template,
+        "path": request.url.path,
+        "query": {key: value for key, value in request.query_params.items() if value and key not in _NO_FILTERS},
+        "base_url": base_url(request),
+        "docs_url": request.app.state.settings.docs_url,
+        "navigation": NAVIGATION if may_read else (),
+        "unread": len(ends) if has_bell else None,
+        "toast": unquote(toast := request.cookies.get(_TOAST, "")),
         "version": PACKAGE_VERSION,
         "signed_in": not request.app.state.keys.is_open,
         # Actions that the key does not permit have no button; routes also refuse them.
@@ -57,7 +73,23 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
     }
     text = request.app.state.templates.get_template(template).render(context)
     text = add_prefix(text, request.app.state.settings.api_root_path or "")
-    return HTMLResponse(text, status_code=status, headers={"Cache-Control": "no-store"})
+    response = HTMLResponse(text, status_code=status, headers={"Cache-Control": "no-store"})
+    if toast:
+        response.delete_cookie(_TOAST, httponly=True, samesite="strict")
+    return response
+
+
+def redirect(where: str, toast: str) -> RedirectResponse:
+    """Send the browser to another page, which shows the message `toast` once."""
+    response = RedirectResponse(where, status_code=303)
+    response.set_cookie(_TOAST, quote(toast), max_age=60, httponly=True, samesite="strict")
+    return response
+
+
+def seen_end(request: Request) -> int:
+    """Return the number of the last end that the visitor has seen; by default, that of yesterday."""
+    seen = request.cookies.get(SEEN, "")
+    return int(seen) if seen.isascii() and seen.isdigit() and len(seen) < 18 else int(1000 * (time.time() - 86400))
 
 
 def base_url(request: Request) -> str:
@@ -69,29 +101,3 @@ def problem_page(request: Request, problem: dict[str, Any]) -> Response:
     if problem["status"] == 401:
         return RedirectResponse("/login", status_code=303)
     return render(request, "problem.html", status=problem["status"], problem=problem, health=None)
-
-
-def job_loader_code(job: JobDetail, base_url: str) -> str:
-    if not any(shard.kind == "base" for shard in job.shards):
-        return ""
-    return f"""import graspd  # pip install 'graspd[api]'
-
-with graspd.Client("{base_url}") as client:  # key="..." where the service asks for one
-    grasps = client.job("{job.id}").grasps()
-best = grasps.valid().top("epsilon", 10)
-best.hand_pose        # (N, 7) x y z [m], quaternion w x y z
-best.joint_positions  # (N, J) rad or m, in the order of best.joint_names
-print(grasps)"""
-
-
-def curl_commands(job: JobDetail, base_url: str) -> str:
-    return "\n".join(f"curl -fL -o {shard.kind}-{shard.batch:04}.h5 {base_url}{shard.file}" for shard in job.shards)
-
-
-def grasp_loader_code(grasp: GraspDetail, base_url: str) -> str:
-    return f"""import graspd  # pip install 'graspd[api]'
-
-with graspd.Client("{base_url}") as client:  # key="..." where the service asks for one
-    grasp = client.shard("{grasp.shard_id}")[{grasp.row}]
-grasp.hand_pose  # (7,) x y z [m], quaternion w x y z
-grasp.joints     # position of each joint by its name, rad or m"""

@@ -8,7 +8,7 @@ from typing import Any, Final
 from sqlalchemy import Connection, delete, func, select, update
 
 from graspd.service.index.database import IndexPart, scope_conditions, upsert
-from graspd.service.index.tables import datasets, deliveries, ends, webhooks
+from graspd.service.index.tables import datasets, deliveries, ends, jobs, webhooks
 from graspd.service.index.views import DeliveryView, EndView, WebhookView
 from graspd.service.model.clock import timestamp
 from graspd.service.model.projects import EVERYTHING, ProjectScope
@@ -45,6 +45,13 @@ class Outbox(IndexPart):
     def end_events(self, since: int, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[EndView]:
         query = select(ends).where(ends.c.seq > since, *scope_conditions(scope, ends)).order_by(ends.c.seq).limit(limit)
         return [EndView(**row) for row in self.database.rows(query)]
+
+    def own_ends(self, owner: str, since: int, *, limit: int, scope: ProjectScope) -> list[tuple[EndView, str]]:
+        """Return a submitter's ends after number `since`, newest first, with the hand and object of a job."""
+        mine = (ends.c.owner == owner, ends.c.seq > since, *scope_conditions(scope, ends))
+        query = select(ends, jobs.c.hand, jobs.c.object).outerjoin(jobs, jobs.c.id == ends.c.subject).where(*mine)
+        rows = self.database.rows(query.order_by(ends.c.seq.desc()).limit(limit))
+        return [(EndView(**row), f"{row['hand']} on {row['object']}" if row["hand"] else "") for row in rows]
 
     def unreported_datasets(self, *, limit: int = 200) -> list[tuple[str, int]]:
         """Return datasets without a report of their end since their last event, with their number of events."""

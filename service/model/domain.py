@@ -60,6 +60,7 @@ _LEVEL_LABELS: Final = {
 }
 _FACE_LABELS: Final = {"drawn": "as dropped", "all": "every stable face"}
 _WANT_LABELS: Final = {"valid": "valid grasps", "candidates": "all candidates"}
+_FIDELITY_HINT: Final = "draft: fastest; fine: most accurate; auto: meets the target"
 _SCENE_LABELS: Final = {"free": "free object", "table": "table", "bin": "bin", "shelf": "shelf"}
 _ENGINE_LABELS: Final = {"none": "none", "physx": "PhysX", "drake": "Drake", "all": "PhysX and Drake"}
 _TYPE_LABELS: Final = {name: name.replace("_", " ") for name in get_args(GraspTypeName)}
@@ -88,28 +89,30 @@ class JobOptions(Model):
     """True for jobs of a service; False for work in this process."""
 
     grasps: Annotated[
-        int, Option("basic", flags="--grasps -n"), FormField("grasps", "Number of grasps", "in batches of 32")
+        int, Option("basic", flags="--grasps -n"), FormField("", "Number of grasps", "in batches of 32")
     ] = Field(32, ge=1, le=1_000_000, description="number of grasps; in a dataset, for each pair of hand and object")
-    method: Annotated[Name, Option("basic")] = Field(
-        "fast_graspd", description=f"planner: {', '.join(METHODS)}, or one of another package"
-    )
-    fidelity: Annotated[str | Fidelity, Option("basic"), FormField("grasps", "Fidelity")] = Field(
-        "standard", description=f"{', '.join(OFFERED)}, or auto with a target"
-    )
-    seed: Annotated[int, Option("basic"), FormField("grasps", "Seed", "same seed, same grasps")] = Field(
+    method: Annotated[
+        Name, Option("basic"), FormField("Planning", "Planner", "makes the candidates", {one: one for one in METHODS})
+    ] = Field("fast_graspd", description=f"planner: {', '.join(METHODS)}, or one of another package")
+    fidelity: Annotated[
+        str | Fidelity,
+        Option("basic"),
+        FormField("Planning", "Fidelity", _FIDELITY_HINT, {one: one for one in (*OFFERED, AUTO)}),
+    ] = Field("standard", description=f"{', '.join(OFFERED)}, or auto with a target")
+    seed: Annotated[int, Option("basic"), FormField("Planning", "Seed", "same seed, same grasps")] = Field(
         0, ge=0, lt=2**31, description="the same seed gives the same grasps"
     )
     scene: Annotated[
         SceneOption,
         Option("basic", typed="scene of the grasps: free, table, bin, shelf, or a JSON or YAML file"),
-        FormField("scenes", "Scene", choices=_SCENE_LABELS, cells=True),
+        FormField("", "Scene", "of planning and validation", choices=_SCENE_LABELS, cells=True),
     ] = _sparse_field(
         "free",
         description="scene in which grasps are planned, validated, rendered and counted: free (a floating object), "
         "table, bin, shelf, or JSON with supports",
     )
     faces: Annotated[
-        Literal["drawn", "all"], Option(), FormField("scenes", "Resting face", choices=_FACE_LABELS, cells=True)
+        Literal["drawn", "all"], Option(), FormField("Scene", "Resting face", "of the object", _FACE_LABELS, cells=True)
     ] = _sparse_field(
         "drawn",
         description="resting faces of the object. drawn: with their frequency after drops; all: one scene for each "
@@ -118,7 +121,7 @@ class JobOptions(Model):
     neighbours: Annotated[
         tuple[BesideOption, ...],
         Option("basic", flags="--with", typed="neighbour in each scene: a name, or for graspd submit a mesh; up to 8"),
-        FormField("scenes", "Neighbours", "names of up to 8 objects", placeholder="block, bottle", cells=True),
+        FormField("Scene", "Neighbours", "up to 8 names; empty: none", placeholder="block, bottle", cells=True),
     ] = _sparse_field(
         (),
         max_length=MOST_NEIGHBOURS,
@@ -127,56 +130,60 @@ class JobOptions(Model):
     touch: Annotated[
         Touch,
         Option(),
-        FormField("scenes", "Fingertip clearance", "to supports; 0: contact allowed, 2: as for the hand", cells=True),
+        FormField("Scene", "Fingertip clearance", "to supports; 0: contact allowed, 2: as for the hand", cells=True),
     ] = _sparse_field(
         TOUCH,
         description="clearance of fingertips to supports [mm]. 2: as for the rest of the hand; 0: contact allowed; "
         "negative: fingertips may press into the support, for flat objects",
     )
     scenes: Annotated[
-        int, Option("basic"), FormField("scenes", "Scenes", "per batch; 0: none if the scene is free, else 4")
+        int, Option("basic"), FormField("Scene", "Scenes", "per batch; 0: none if the scene is free, else 4")
     ] = Field(0, ge=0, le=64, description=f"scenes per batch; 0: none if the scene is free, else {SCENES}")
-    views: Annotated[int, Option("basic", places=JOB), FormField("scenes", "Views", "camera placements per scene")] = (
-        Field(0, ge=0, le=256, description="camera placements per scene")
-    )
-    stereo: Annotated[bool, Option(places=JOB), FormField("scenes", "Cameras", "Stereo: left and right eye")] = Field(
+    views: Annotated[
+        int, Option("basic", places=JOB), FormField("Pictures", "Views", "camera placements per scene")
+    ] = Field(0, ge=0, le=256, description="camera placements per scene")
+    stereo: Annotated[bool, Option(places=JOB), FormField("Pictures", "Cameras", "Stereo: left and right eye")] = Field(
         False, description="render a left and a right picture per placement"
     )
-    width: Annotated[int, Option(places=JOB), FormField("scenes", "Width")] = Field(
+    width: Annotated[int, Option(places=JOB), FormField("Pictures", "Width", "of each picture")] = Field(
         320, ge=16, le=4096, description="picture width [px]"
     )
-    height: Annotated[int, Option(places=JOB), FormField("scenes", "Height")] = Field(
+    height: Annotated[int, Option(places=JOB), FormField("Pictures", "Height", "of each picture")] = Field(
         240, ge=16, le=4096, description="picture height [px]"
     )
-    channels: Annotated[tuple[Literal["distance", "normals", "occlusion"], ...], Option(places=JOB)] = Field(
-        (), description="image channels besides colour, depth and segmentation: distance, normals or occlusion"
-    )
+    channels: Annotated[
+        tuple[Literal["distance", "normals", "occlusion"], ...],
+        Option(places=JOB),
+        FormField("Pictures", "Further channels", "besides colour, depth and labels", placeholder="distance, normals"),
+    ] = Field((), description="image channels besides colour, depth and segmentation: distance, normals or occlusion")
     type: Annotated[
-        GraspTypeName, Option("basic", schema=7), FormField("grasps", "Grasp type", choices=_TYPE_LABELS, cells=True)
+        GraspTypeName, Option("basic", schema=7), FormField("Grasp", "Grasp type", "", _TYPE_LABELS, cells=True)
     ] = _sparse_field(
         "any",
         description="type of the grasps by contact: power, precision, pinch, lateral, or a type of the GRASP taxonomy. "
         "balanced: power, precision and pinch in turn, one per batch",
     )
     digits: Annotated[
-        tuple[DigitName, ...], Option(schema=7, typed="digit that may touch, such as thumb; the others stay open")
+        tuple[DigitName, ...],
+        Option(schema=7, typed="digit that may touch, such as thumb; the others stay open"),
+        FormField("Grasp", "Digits", "that may touch; empty: all", placeholder="thumb, index"),
     ] = _sparse_field((), max_length=6, description="digits that may touch: thumb, index, middle, ring, little")
     touch_region: Annotated[
         Region,
         Option(schema=7),
-        FormField("grasps", "Contact region", "bounds [m], part or colour", placeholder="z > 0.05", cells=True),
+        FormField("Grasp", "Contact region", "bounds, part or colour", placeholder="z > 0.05", cells=True),
     ] = _sparse_field(
         "",
         description="region of all contacts: bounds in the object's frame [m], such as z > 0.05, x < 0.02. part NAME: "
         "a group, object or material of an OBJ; a node, mesh or material of a GLB. color #rrggbb: faces of this colour",
     )
-    avoid_region: Annotated[Region, Option(schema=7)] = _sparse_field(
-        "", description="region without contacts: bounds [m] such as z > 0.1, part NAME or color #rrggbb"
-    )
+    avoid_region: Annotated[
+        Region, Option(schema=7), FormField("Grasp", "Avoided region", "without contacts", placeholder="z > 0.1")
+    ] = _sparse_field("", description="region without contacts: bounds [m] such as z > 0.1, part NAME or color #rrggbb")
     approach_cone: Annotated[
         Cone,
         Option(schema=7),
-        FormField("grasps", "Approach cone", "axis and angle", placeholder="0, 0, -1, 30", cells=True),
+        FormField("Grasp", "Approach cone", "axis and angle; empty: any", placeholder="0, 0, -1, 30", cells=True),
     ] = _sparse_field(
         "",
         description="cone of the palm's approach: axis and largest angle [deg], such as 0, 0, -1, 30. The axis is in "
@@ -185,36 +192,36 @@ class JobOptions(Model):
     like: Annotated[
         WristPose,
         Option(schema=7),
-        FormField("grasps", "Wrist pose", "x, y, z, qw, qx, qy, qz", placeholder="0, 0, 0.1, 1, 0, 0, 0", cells=True),
+        FormField("Grasp", "Wrist pose", "x, y, z, quaternion wxyz", placeholder="0, 0, 0.1, 1, 0, 0, 0", cells=True),
     ] = _sparse_field(
         "",
         description="demonstrated wrist pose x, y, z, qw, qx, qy, qz in the object's frame [m]. Grasps start around it "
         "and stay within 4 cm and 30 degrees",
     )
-    friction: Annotated[float, Option(), FormField("grasps", "Friction coefficient", "Coulomb, for the metrics")] = (
-        Field(1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics")
+    friction: Annotated[float, Option(), FormField("Object", "Friction of the metrics", "Coulomb coefficient")] = Field(
+        1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics"
     )
     mass: Annotated[
-        Mass | None, Option("basic", schema=5), FormField("grasps", "Mass of the object", "empty: its own, else 0.1 kg")
+        Mass | None, Option("basic", schema=5), FormField("Object", "Mass", "empty: its own, else 0.1 kg")
     ] = _sparse_field(None, description=f"mass of the object [kg]; default: its own, else {MASS_KG:g} kg")
-    density: Annotated[Density | None, Option(schema=5)] = _sparse_field(
-        None, description="density of the object [kg/m^3], instead of the mass"
+    density: Annotated[Density | None, Option(schema=5), FormField("Object", "Density", "instead of the mass")] = (
+        _sparse_field(None, description="density of the object [kg/m^3], instead of the mass")
     )
     object_friction: Annotated[
         Friction | None,
         Option(schema=5),
-        FormField("grasps", "Friction in simulation", "Coulomb; empty: the object's own, else 0.6"),
+        FormField("Object", "Friction in simulation", "Coulomb; empty: its own, else 0.6"),
     ] = _sparse_field(
         None, description=f"Coulomb coefficient of contacts in simulation; default: the object's own, else {FRICTION:g}"
     )
     want: Annotated[
-        Literal["valid", "candidates"], Option("basic"), FormField("grasps", "Counted grasps", choices=_WANT_LABELS)
+        Literal["valid", "candidates"], Option("basic"), FormField("Planning", "Counted grasps", "", _WANT_LABELS)
     ] = Field("valid", description="grasps that count: valid (without validation: feasible) ones, or all candidates")
-    budget: Annotated[float, Option()] = Field(
+    budget: Annotated[float, Option(), FormField("Planning", "Budget", "candidates per requested valid grasp")] = Field(
         4.0, ge=1, le=100, description="maximum number of candidates per requested valid grasp"
     )
     min_distance: Annotated[
-        float, Option(), FormField("grasps", "Least distance", "between two grasps of a batch; 0: no limit", cells=True)
+        float, Option(), FormField("Planning", "Least distance", "of two grasps of a batch; 0: no limit", cells=True)
     ] = _sparse_field(
         MIN_DISTANCE_M,
         ge=0,
@@ -226,12 +233,14 @@ class JobOptions(Model):
     validation: Annotated[
         Literal["dexgraspbench", "standard", "fast", "none"],
         Option("basic"),
-        FormField("grasps", "Validation in MuJoCo", choices=_LEVEL_LABELS),
+        FormField("Validation", "Level", "of validation in MuJoCo", _LEVEL_LABELS),
     ] = Field(
         "standard",
         description="level of validation in MuJoCo. fast: MuJoCo Warp on a GPU decides clear cases; none: no verdicts",
     )
-    rechecks: Annotated[int, Option(places=JOB)] = Field(
+    rechecks: Annotated[
+        int, Option(places=JOB), FormField("Validation", "Rechecks", "valid grasps, at level dexgraspbench")
+    ] = Field(
         RECHECKS,
         ge=0,
         le=10_000,
@@ -241,7 +250,7 @@ class JobOptions(Model):
     robust: Annotated[
         float,
         Option("basic"),
-        FormField("grasps", "Robust share", "of 8 perturbed models in which a grasp must hold; 0: none", cells=True),
+        FormField("Validation", "Robust share", "of perturbed models that must hold; 0: none", cells=True),
     ] = _sparse_field(
         0.0,
         ge=0,
@@ -250,17 +259,21 @@ class JobOptions(Model):
         description="share of perturbed models in which a grasp must hold to count; 0: no requirement. With want "
         "candidates, all grasps are stored",
     )
-    robust_models: Annotated[int, Option()] = _sparse_field(
+    robust_models: Annotated[
+        int, Option(), FormField("Validation", "Perturbed models", "per valid grasp; 0: 8 if a share is given")
+    ] = _sparse_field(
         0,
         ge=0,
         le=MOST_ROBUST_MODELS,
         description=f"number of perturbed models per valid grasp; 0: {ROBUST_MODELS} if `robust` is given, else none",
     )
-    payload: Annotated[bool, Option(schema=5)] = _sparse_field(False, description="measure the payload of valid grasps")
+    payload: Annotated[
+        bool, Option(schema=5), FormField("Validation", "Payload", "Measure it for each valid grasp")
+    ] = _sparse_field(False, description="measure the payload of valid grasps")
     min_payload: Annotated[
         float,
         Option(schema=5),
-        FormField("grasps", "Least payload", "mass that a grasp must lift to count; 0: no requirement", cells=True),
+        FormField("Validation", "Least payload", "mass that a grasp must lift to count; 0: no requirement", cells=True),
     ] = _sparse_field(
         0.0,
         ge=0,
@@ -268,19 +281,21 @@ class JobOptions(Model):
         allow_inf_nan=False,
         description="mass that a grasp must lift to count [kg], which implies `payload`; 0: no requirement",
     )
-    shake: Annotated[bool, Option(schema=5), FormField("scenes", "After the lift", "Shake: 2 cm, 3 Hz", cells=True)] = (
-        _sparse_field(False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y")
-    )
+    shake: Annotated[
+        bool, Option(schema=5), FormField("Validation", "After the lift", "Shake: 2 cm, 3 Hz", cells=True)
+    ] = _sparse_field(False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y")
     second_engine: Annotated[
         SecondEngine,
         Option("basic", schema=SCHEMA_OF_ENGINES),
-        FormField("grasps", "Second engine", choices=_ENGINE_LABELS, cells=True),
+        FormField("Validation", "Second engine", "for a share of the grasps", _ENGINE_LABELS, cells=True),
     ] = _sparse_field(
         "none",
         description="engine besides MuJoCo that validates a share of the valid grasps: physx, drake, or all. With "
         "`robust`, only grasps that all named engines hold count",
     )
-    second_engine_share: Annotated[float, Option(schema=SCHEMA_OF_ENGINES)] = _sparse_field(
+    second_engine_share: Annotated[
+        float, Option(schema=SCHEMA_OF_ENGINES), FormField("Validation", "Second engine's share", "of the valid grasps")
+    ] = _sparse_field(
         0.1,
         gt=0,
         le=1,
@@ -295,8 +310,11 @@ class JobOptions(Model):
             | Annotated[str, Field(max_length=80)],
         ],
         Option(flags="--option", typed="option of the planner, such as steps=20000"),
+        FormField("Planning", "Options of the planner", "name=value; empty: none", placeholder="steps=20000"),
     ] = Field(default_factory=dict, max_length=16, description="options of the planner; see docs/how-to/planners.md")
-    target: Annotated[str, Option(places=JOB)] = Field(
+    target: Annotated[
+        str, Option(places=JOB), FormField("Planning", "Target", "of fidelity auto", placeholder="gsr>=0.6")
+    ] = Field(
         "",
         max_length=40,
         description="required accuracy, for which fidelity `auto` selects the cheapest one in the published chart: "

@@ -27,7 +27,8 @@ _UNIT: Final = re.compile(r"\[([^\]]+)\]")
 class FormField:
     """Input of an option in a dashboard form."""
 
-    section: Literal["grasps", "scenes"]
+    group: Literal["", "Planning", "Grasp", "Object", "Scene", "Validation", "Pictures"]
+    """Title of a group of advanced options; empty: the form shows the option first."""
     label: str
     hint: str = ""
     choices: Mapping[str, str] = field(default_factory=dict)

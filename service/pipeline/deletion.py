@@ -32,6 +32,8 @@ from graspd.service.store.store import Store
 log = logging.getLogger(__name__)
 RecordT = TypeVar("RecordT", bound=Record)
 BUDGET_S: Final = 0.5
+#: Time [s] for which a refused upload is stored, so that a form can check it again with other options.
+REFUSED_S: Final = 3600.0
 _AT_ONCE: Final = 200
 
 
@@ -256,8 +258,10 @@ class GarbageCollector:
         return False
 
     def collect(self, budget_s: float = BUDGET_S) -> bool:
-        """Delete stored objects whose grace time is over, and unneeded shards; return whether work is left."""
+        """Delete refused uploads, objects whose grace time is over, unneeded shards; return whether work is left."""
         deadline = self._clock() + budget_s
+        if self._delete_refused(deadline):
+            return True
         before = timestamp(self._services.settings.shard_grace_s)
         # The record of a deletion is deleted last.
         removed = [entry.key for entry in self._services.store.list(names.REMOVED)]
@@ -277,6 +281,22 @@ class GarbageCollector:
                     return True
                 self._remove_shard(stage, shard)
             self._services.store.delete(key)
+        return False
+
+    def _delete_refused(self, deadline: float) -> bool:
+        """Delete refused uploads after `REFUSED_S`, unless a job needs them; return whether work is left."""
+        store, index = self._services.store, self._services.index
+        for asset in index.assets.refused(before=timestamp(REFUSED_S)):
+            if self._clock() > deadline:
+                return True
+            record = names.asset_record_key(asset.kind, asset.digest)
+            with index.database.write_transaction() as connection:
+                if index.removals.reason_to_keep_asset(asset, within=connection):
+                    continue
+                for key in _record_last(_keys_below(store, record.rpartition("/")[0]), record):
+                    store.delete(key)
+                index.removals.remove_asset(asset.kind, asset.digest, within=connection)
+            log.info("the refused %s %s is deleted", asset.kind.value, asset.name)
         return False
 
     def _read_records(self, model: type[RecordT], folder: str) -> Iterator[tuple[str, RecordT]]:

@@ -1,6 +1,7 @@
 """The pages in a real browser: they move by themselves, fit every screen, read without scripts, are accessible."""
 
 import re
+from itertools import product
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -15,7 +16,7 @@ from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.store.records import publish_record
 from tests.api.dashboard.test_tradeoff import RUNS, a_record
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
-from tests.fakes import plan_all, record_of
+from tests.fakes import beat_of, plan_all, record_of
 from tests.waiting import until
 
 pytestmark = pytest.mark.browser
@@ -23,7 +24,9 @@ AXE = Path(__file__).parent / "vendor" / "axe.min.js"
 #: Rules of axe that look at colours; what is serious of the others is so in every scheme.
 COLOURS = ["color-contrast", "link-in-text-block"]
 #: Pages that show all colours between them.
-IN_DARK = re.compile(r"/$|/datasets/kitchen$|/jobs/|/grasps$|/grasps/|/hands/|/stability|/chart|/submit|/problems")
+IN_DARK = re.compile(
+    r"/$|/datasets/kitchen$|/jobs/|/grasps$|/grasps/|/hands/|/stability|/chart|/submit|/engine|/notifications"
+)
 CHART = {"created": "2026-11-21T12:00:00Z", "device": "cpu", "runs": RUNS}
 
 
@@ -44,9 +47,11 @@ def places(services: Services) -> list[str]:
     gone = add_job(services, seed=11)
     fail(services, gone, "a reason")
     deletion.delete_job(services, gone.id)
-    datasets = "/ /datasets /datasets/kitchen /datasets/kitchen?state=queued /compare?one=kitchen&other=kitchen"
+    datasets = "/ /datasets /datasets/kitchen /datasets/kitchen?state=queued /compare?one=kitchen&other=kitchen /engine"
     grasps = "/grasps /grasps?view=table /grasps?min_epsilon=99 /grasps?tag=good+ones /hands /hands/shadow"
-    others = "/docs /workers /chart /stability /submit /problems /login /deleted /usage"
+    others = (
+        "/docs /workers /chart /stability /submit /submit?density=400 /notifications /problems /login /deleted /usage"
+    )
     of_these = [f"/jobs/{record.id}", f"/jobs/{waiting.id}", f"/grasps/{shard}/0"]
     return [*datasets.split(), *of_these, *grasps.split(), *others.split()]
 
@@ -148,7 +153,7 @@ BESIDE_CARDS = """() => [...document.querySelectorAll('.card')].flatMap(card => 
     }).map(one => `${card.className}: ${one.outerHTML.slice(0, 80)}`);
 })"""
 #: Tables that a phone shows as lines: nothing of them is cut off.
-TABLES_OF_LINES = ("/", "/hands", "/problems", "/deleted")
+TABLES_OF_LINES = ("/", "/hands", "/problems", "/deleted", "/notifications")
 
 
 def test_a_phone_shows_all_of_short_tables(page: Any, places: list[str]) -> None:
@@ -200,6 +205,28 @@ def test_no_page_has_a_serious_accessibility_finding(page: Any, places: list[str
                 if entry["impact"] in ("serious", "critical") and (nodes := _nodes(entry))
             ]
     assert found == []
+
+
+def test_forms_and_notices_are_accessible_at_every_width(page: Any, services: Services, places: list[str]) -> None:
+    record = add_job(services, seed=12)
+    task = next(plan_tasks(record)).id
+    services.index.live.set_workers([beat_of("worker-2", state="busy", task_id=task)], forget_before="2000")
+    services.index.live.set_running({task: "worker-2"})
+    page.emulate_media(reduced_motion="reduce")
+    opened = "document.querySelectorAll('details').forEach(one => one.open = true)"
+    for path in ("/submit?density=400", "/notifications", "/engine", "/workers", "/deleted", f"/jobs/{record.id}"):
+        page.goto(path)
+        if path.startswith("/jobs/"):
+            page.click("button:has-text('Cancel')")
+            page.wait_for_selector(".toast:has-text('The job is cancelled')")
+        page.evaluate(f"{opened}; {AXE.read_text()}")
+        for width, scheme in product((1440, 1024, 390), ("light", "dark")):
+            page.set_viewport_size({"width": width, "height": 800})
+            page.emulate_media(color_scheme=scheme)
+            result = page.evaluate("axe.run(document, { resultTypes: ['violations'] })")
+            assert [(one["id"], _nodes(one)[:3]) for one in result["violations"]] == [], (path, width, scheme)
+            assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), (path, width)
+            assert width > 390 or page.evaluate(BESIDE_CARDS) == [], path
 
 
 def _text_of(page: Any, path: str) -> str:

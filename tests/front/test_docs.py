@@ -68,9 +68,11 @@ def test_the_code_on_the_pages_of_the_dashboard_runs(environment: dict[str, str]
         job = client.submit("barrett", "mug", grasps=8, fidelity="draft").wait()
         shard = http.get(f"/v1/jobs/{job.id}").json()["shards"][0]["id"]
         pages = [http.get(page).text for page in (f"/jobs/{job.id}", f"/grasps/{shard}/3")]
-    codes = [html.unescape(re.findall(r'<pre id="loader"[^>]*>(.*?)</pre>', page, re.DOTALL)[0]) for page in pages]
+    codes = [
+        html.unescape(re.findall(r'<pre id="snippet-python"[^>]*>(.*?)</pre>', page, re.DOTALL)[0]) for page in pages
+    ]
     assert "<8 grasps of barrett on mug, 8 valid>" in run(codes[0], environment, tmp_path)
-    assert "<grasp at " in run(codes[1] + "\nprint(grasp)", environment, tmp_path)
+    assert "<grasp at " in run(codes[1], environment, tmp_path)
 
 
 def test_the_notebook_is_stored_with_its_outputs() -> None:

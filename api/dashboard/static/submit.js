@@ -20,11 +20,6 @@
     return body;
   }
 
-  /** Refused file; `page` is HTML with the reason, and buttons of fixes. */
-  class Refused extends Error {
-    constructor(asset, page) { super(asset.message); this.page = page; }
-  }
-
   async function check(kind, file, options) {
     const data = new FormData();
     data.append("file", file);
@@ -39,7 +34,8 @@
     }
     if (asset.verdict === "refuse") {
       const page = await fetch(`${root}submit/refusals/${kind}/${asset.digest}`);
-      throw new Refused(asset, page.ok ? await page.text() : "");
+      // HTML with the reason, and buttons of fixes.
+      throw Object.assign(new Error(asset.message), { page: page.ok ? await page.text() : "" });
     }
     return asset;
   }
@@ -54,7 +50,7 @@
   function wire(thing) {
     const kind = thing.dataset.thing;
     const input = thing.querySelector("input[type=file]");
-    const units = thing.querySelector("select[name=units]");
+    const units = thing.querySelector(".ways");
     const said = thing.querySelector("[data-found]");
     const select = thing.querySelector(`select[name=${kind}]`);
     const figure = thing.querySelector("figure");
@@ -80,7 +76,7 @@
     async function upload() {
       if (!held) return;
       const [file, mine] = [held, ++round];
-      const unit = units?.value ?? "m";
+      const unit = units ? form.elements.units.value : "m";
       const options = unit === "m" ? fixes : { ...fixes, units: unit };
       say(`Checking ${file.name}`, "busy");
       show("", `${file.name} (being checked)`, "");
@@ -115,7 +111,7 @@
       event.preventDefault();
       for (const [key, value] of Object.entries(JSON.parse(button.value))) {
         const field = said.querySelector(`input[name=${kind}_${key}]`);
-        if (key === "units" && units) units.value = value;
+        if (key === "units" && units) form.elements.units.value = value;
         else if (value !== null) fixes[key] = typeof value === "object" ? { ...fixes[key], ...value } : value;
         else if (field.value === "" || !field.reportValidity()) return field.focus();
         else fixes[key] = key === "scale_to" ? Number(field.value) / 1000 : field.value;
@@ -143,5 +139,7 @@
   }
 
   document.querySelectorAll("[data-thing]").forEach(wire);
+  // A closed group would hide an invalid field from the browser's message.
+  form.addEventListener("invalid", (event) => { const group = event.target.closest("details"); if (group) group.open = true; }, true);
   form.addEventListener("submit", (event) => { if (waiting.size) event.preventDefault(); });
 })();

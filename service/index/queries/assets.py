@@ -46,6 +46,11 @@ class Assets(database.IndexPart):
         names = self.database.column(known.distinct().order_by(assets.c.name).limit(SEARCHED))
         raise NotFoundError(f"there is no {kind.value} {name_or_digest!r}{available_names(name_or_digest, names)}")
 
+    def refused(self, *, before: str, limit: int = 200) -> list[AssetView]:
+        """Return refused assets that were uploaded before a time, oldest first."""
+        query = select(assets).where(assets.c.verdict == "refuse", assets.c.created < before)
+        return [AssetView(**row) for row in self.database.rows(query.order_by(assets.c.created).limit(limit))]
+
     def sizes(self, kind: AssetKind, wanted: Collection[str], *, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
         """Return the sizes [bytes] of the named hands or objects; unknown names are omitted."""
         query = select(assets.c.name, assets.c.size_bytes).order_by(assets.c.created)

@@ -51,6 +51,7 @@ def fields_of(page: str) -> dict[str, str]:
         for name, body in re.findall(r'<select[^>]*name="(\w+)"[^>]*>(.*?)</select>', page, re.DOTALL)
     }
     hidden = dict(re.findall(r'<input type="hidden" name="(\w+)" value="([^"]*)"', page))
+    hidden |= dict(re.findall(r'<input type="radio" name="(\w+)" value="([^"]*)" checked', page))
     return FORM | picked | hidden
 
 

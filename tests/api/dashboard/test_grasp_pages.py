@@ -48,7 +48,7 @@ def test_the_page_of_a_grasp_tells_quality_and_where_it_is_kept(http: TestClient
     assert f'href="/v1/shards/{shard}/file"' in page
     assert f'href="/jobs/{record.id}"' in page
     assert f'rel="prev" href="/grasps/{shard}/2"' in page
-    assert f"client.shard(&#34;{shard}&#34;)[3]" in page
+    assert f"client.shard(&#39;{shard}&#39;)[3]" in page
     assert "cm³" in page
 
 

@@ -2,19 +2,30 @@
 
 import io
 import re
+import shlex
+from collections.abc import Callable
+from html import unescape
+from typing import Any
 from unittest.mock import Mock
 
+import httpx
 import pytest
 from PIL import Image
 from starlette.testclient import TestClient
+from typer.testing import CliRunner
 
+from graspd.api.dashboard.forms import INPUTS
+from graspd.cli import build_app
+from graspd.client.client import Client
 from graspd.service.index.notes import Damage
+from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import QueueUnavailable
-from graspd.service.model.fidelity import OFFERED
 from graspd.service.model.planning import plan_tasks
 from graspd.service.model.states import State
 from graspd.service.pipeline.backends import Services
+from tests.api.conftest import BASE_URL
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
+from tests.fakes import beat_of
 from tests.memory_queue import MemoryQueue
 
 FORM = {"hand": "allegro", "object": "mug", "grasps": "32", "fidelity": "standard", "seed": "0", "friction": "1.0"}
@@ -53,7 +64,7 @@ def test_a_finished_job_shows_quality_views_files_and_code(http: TestClient, ser
     assert page.count("<img ") == 4 * 3  # colour, depth, segmentation
     assert all(f"/v1/shards/{manifest.shard_id}/file" in page for manifest in manifests)
     assert "cm²" in page
-    assert f"client.job(&#34;{record.id}&#34;).grasps()" in page
+    assert f"client.job(&#39;{record.id}&#39;).grasps()" in page
 
 
 def test_a_job_that_has_not_ended_can_be_cancelled_on_its_page(http: TestClient, services: Services) -> None:
@@ -115,7 +126,17 @@ def test_the_buttons_cancel_and_retry_a_job(http: TestClient, services: Services
 
 def test_no_page_asks_for_anything_from_elsewhere_or_inline(http: TestClient) -> None:
     served = set()
-    for path in ("/", "/datasets", "/grasps", "/workers", "/chart", "/stability", "/submit", "/problems"):
+    for path in (
+        "/",
+        "/datasets",
+        "/grasps",
+        "/workers",
+        "/engine",
+        "/chart",
+        "/stability",
+        "/submit",
+        "/notifications",
+    ):
         page = http.get(path).text
         addresses = re.findall(r'(?:src|href|action)="([^"]*)"', page)
         assert addresses and all(address.startswith(("/", "#")) for address in addresses)
@@ -138,6 +159,112 @@ def test_pages_are_read_without_redis(http: TestClient, services: Services, monk
     assert 'graspd_part_up{part="redis"} 0.0' in http.get("/metrics").text
 
 
-@pytest.mark.parametrize("said", [{}, {"mass": "0.4", "min_payload": "0.5"}])
-def test_the_form_tells_what_each_fidelity_costs(http: TestClient, said: dict[str, str]) -> None:
-    assert http.get("/submit", params=said).text.count("on one worker") == len(OFFERED)
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ({}, r"About .* on one worker \(.* to .*\) for 32 valid grasps from \d+ candidates"),
+        ({"mass": "0.4", "min_payload": "0.5"}, r"About .* on one worker"),
+        ({"validation": "none", "grasps": "64"}, r"for 64 feasible grasps from"),
+        ({"grasps": "0"}, "No estimate until all values are valid"),
+        ({"fidelity": "auto", "target": "gsr>=0.6"}, "No estimate until all values are valid"),
+        ({"options": "steps"}, "No estimate until all values are valid"),
+    ],
+)
+def test_the_form_estimates_its_cost_in_a_sentence(http: TestClient, said: dict[str, str], words: str) -> None:
+    answer = http.get("/submit", params=said)
+    assert answer.status_code == 200
+    assert re.search(words, text_of(re.findall(r'<p id="estimate".*?</p>', answer.text, re.DOTALL)[0]))
+
+
+def text_of(page: str) -> str:
+    return unescape(re.sub(r"\s+", " ", re.sub(r"<[^>]*>", "", page)))
+
+
+def test_the_form_has_every_option_of_a_job_in_a_group_with_help(http: TestClient) -> None:
+    first, _, advanced = http.get("/submit").text.partition("<details")
+    fields = dict(re.findall(r'<(?:input|select)[^>]*? name="(\w+)"()', advanced))
+    assert set(fields) >= set(JobOptions.model_fields) - {"grasps", "scene"}
+    assert {"grasps", "scene"} <= set(re.findall(r'id="(\w+)" name="\w+"', first))
+    assert all(one.hint for one in INPUTS)
+    for name, words in {"mass": "Mass [kg]", "width": "of each picture; default 320", "views": "default 0"}.items():
+        assert words in advanced, name
+    assert "<details" in (closed := http.get("/submit").text) and 'advanced" open' not in closed
+    for said in ({"density": "400"}, {"payload": "true"}):
+        assert 'advanced" open' in http.get("/submit", params=said).text
+    assert 'advanced" open' in http.post("/submit", data=FORM | {"digits": "elbow"}).text
+
+
+OPTIONS = {"grasps": "8", "type": "pinch", "digits": "thumb, index", "payload": "true", "options": "steps=90"}
+
+
+def test_snippets_submit_the_job_of_the_form(http: TestClient, services: Services, calls: Any) -> None:
+    command = calls(http.get("/submit", params=OPTIONS | {"density": "400.5", "neighbours": ""}).text)
+    (job,) = services.index.jobs.page().items
+    assert (job.request.digits, job.request.options, job.request.payload) == (("thumb", "index"), {"steps": 90}, True)
+    assert CliRunner().invoke(build_app(), shlex.split(command)[1:]).exit_code == 0
+    http.post("/submit", data=FORM | OPTIONS | {"density": "400.5"})
+    assert [one.id for one in services.index.jobs.page().items] == [job.id]
+
+
+@pytest.fixture
+def calls(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], str]:
+    """Runs the Python code of a page against the service; returns the page's commands."""
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        sent = {"content": request.read(), "headers": {"content-type": "application/json"}}
+        found = http.request(request.method, str(request.url), **sent)
+        return httpx.Response(found.status_code, content=found.content)
+
+    client = Client(BASE_URL, transport=httpx.MockTransport(answer))
+    for module in ("graspd.remote", "graspd.client.commands"):
+        monkeypatch.setattr(f"{module}.open_client", lambda url, key=None: client)
+    monkeypatch.setattr(client, "close", lambda: None)
+
+    def run(page: str) -> str:
+        found = {
+            kind: unescape(code) for kind, code in re.findall(r'<pre id="snippet-(\w+)"[^>]*>(.*?)</pre>', page, re.S)
+        }
+        exec(found.get("python", ""), {})
+        return found["shell"]
+
+    return run
+
+
+def test_every_page_has_code_for_what_it_shows(http: TestClient, services: Services, calls: Any) -> None:
+    record = add_job(services)
+    shard = finish_all(services, record)[0].shard_id
+    http.post("/v1/datasets", json={"name": "kitchen", "hands": ["allegro"], "objects": ["mug"]}).raise_for_status()
+    pages = (
+        "/ /?state=failed /submit /datasets /datasets/kitchen /compare?one=kitchen&other=kitchen /hands /hands/shadow"
+    )
+    pages += " /workers /usage /deleted /notifications /chart /stability /engine /grasps?valid=true&min_epsilon=0.1"
+    for path in (*pages.split(), f"/jobs/{record.id}", f"/grasps/{shard}/0"):
+        for line in calls(http.get(path).text).splitlines():
+            words = shlex.split(line)
+            if words[0] == "curl":
+                assert http.get(words[-1] if "&&" not in words else words[4]).status_code == 200, line
+            else:
+                told = CliRunner().invoke(build_app(), [*words[1:], "--help"])
+                assert (words[0], told.exit_code) == ("graspd", 0), line
+
+
+def test_a_toast_tells_once_what_happened(http: TestClient, services: Services) -> None:
+    job = http.post("/submit", data=FORM)
+    assert "The job is submitted." in job.text and "The job is submitted." not in http.get(job.url.path).text
+    assert "The same job existed already" in http.post("/submit", data=FORM).text
+    for action, words in (("cancel", "The job is cancelled"), ("retry", "run again")):
+        assert words in http.post(f"{job.url.path}/{action}").text
+    http.cookies.set("graspd_toast", "%3Cscript%3E")
+    assert "<script>" not in re.findall(r'<p class="alert good toast".*', http.get("/").text)[0]
+
+
+def test_a_worker_s_card_names_task_phase_and_fidelity_apart(http: TestClient, services: Services) -> None:
+    record = add_job(services, fidelity="draft")
+    task = next(plan_tasks(record))
+    beat = beat_of("worker-1", state="busy", task_id=task.id)
+    services.index.live.set_workers([beat], forget_before="2000-01-01T00:00:00Z")
+    services.index.live.set_running({task.id: "worker-1"})
+    services.index.live.set_progress({task.id: (1.0, 4.0, "starts")})
+    rows = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", http.get("/workers").text))
+    told = {name: text_of(rows[name]) for name in ("Task", "Stage", "Phase", "Fidelity")}
+    assert told == {"Task": "allegro × mug, batch 0", "Stage": "synthesize", "Phase": "starts", "Fidelity": "draft"}

@@ -75,7 +75,7 @@ def test_redirects_and_cookies_are_below_the_prefix(http: TestClient, below: Set
 
 def test_api_and_client_work_below_a_prefix(http: TestClient, services: Services, tmp_path: Any) -> None:
     finish_all(services, job := add_job(services))
-    assert f"{BASE_URL}{PREFIX}/v1/shards/" in http.get(f"{PREFIX}/jobs/{job.id}").text, "a snippet, too"
+    assert f'Client("{BASE_URL}{PREFIX}")' in http.get(f"{PREFIX}/jobs/{job.id}").text, "a snippet, too"
     assert http.get(f"{PREFIX}/openapi.json").json()["servers"] == [{"url": PREFIX}]
     made = http.post(f"{PREFIX}/v1/jobs", json={"hand": "allegro", "object": "mug", "grasps": 32})
     assert http.get(made.headers["location"]).json()["id"] == made.json()["id"]

@@ -308,3 +308,15 @@ def _after(count: int, real: Any) -> Any:
         real(store, key)
 
     return delete
+
+
+def test_a_refused_upload_is_deleted_after_an_hour(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
+    bad, good = add_asset(services, "object", "bad", verdict="refuse"), add_asset(services, "object", "good")
+    collector = GarbageCollector(services)
+    collector.collect()
+    assert services.index.assets.get(AssetKind.OBJECT, bad).verdict == "refuse", "a form may check it again"
+    monkeypatch.setattr("graspd.service.pipeline.deletion.REFUSED_S", -1.0)
+    collector.collect()
+    assert keys(services, f"assets/object/{bad}", "removed", "deletions") == set()
+    assert differences(services.index, services.store) == []
+    assert services.index.assets.get(AssetKind.OBJECT, "good").digest == good

@@ -215,6 +215,7 @@ VALUES: dict[str, Any] = {
     "join": "4",
     "worker_number": 0,
     "api_root_path": "/graspd",
+    "docs_url": "https://docs.example.org/a?b=%20",
     "lease_s": 4 / 3,
     "quota_jobs_per_day": 7,
 }
