@@ -26,7 +26,7 @@ _PAGE: Final = 200
 _LOOKED_AT: Final = 20
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _SHARED: Final = Job.model_fields.keys() & JobView.model_fields.keys() - {"reason", "stages"}
-_DETAILS: Final = ("request", "choice", "note", "outcomes", "rechecked", "recheck_held", "hand_digest", "object_digest")
+_DETAILS: Final = JobDetail.model_fields.keys() & JobView.model_fields.keys() - Job.model_fields.keys() | {"note"}
 
 
 class Shards:
@@ -142,7 +142,7 @@ class Jobs:
         return Page[Job](items=[self._job_model(job, ()) for job in page.items], next=page.next)
 
     def get(self, job_id: str) -> JobDetail:
-        return self._job_detail(self._services.index.jobs.get(job_id, scope=project_scope()))
+        return self._job_detail(self._services.index.jobs.get(job_id, details=True, scope=project_scope()))
 
     def get_progress(self, job_id: str) -> Job:
         """Return a job with only the progress of its stages, for event streams."""

@@ -6,6 +6,7 @@ import os
 import time
 import traceback
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 from pydantic import ValidationError
@@ -94,6 +95,7 @@ class Runner:
         if made is not None and isinstance(message, messages.TaskMessage):
             context.check()
             device, worker = context.device, self._worker
+            made = replace(made, info={**made.info, "log": context.log()})
             manifest, data = build_shard(message, made, device=device, seconds=seconds, worker=worker, lost=lost)
             if lost is not None and manifest.sha256 != lost.sha256:
                 raise errors.DamagedShard(
@@ -152,6 +154,7 @@ class Runner:
             worker=self._worker,
             started=started,
             last=last,
+            log=context.log(),
         )
         try:
             if isinstance(message, messages.TaskMessage) and _has_manifest(message, context):

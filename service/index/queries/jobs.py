@@ -1,13 +1,16 @@
 """Queries of jobs, tasks, attempts and shards, and the outcomes of a job's candidates."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Final, Literal
 
-from sqlalchemy import Column, ColumnElement, Connection, Float, and_, case, cast, func, select
+from sqlalchemy import Column, ColumnElement, Connection, Float, Select, and_, case, cast, func, not_, or_, select
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.functions import FunctionElement
 
 from graspd.service.index import database
-from graspd.service.index.tables import attempts, jobs, shards, tasks
+from graspd.service.index.tables import attempts, dataset_cells, jobs, shards, tasks
 from graspd.service.index.views import AttemptView, JobView, Page, ShardView, StageProgress, TaskView
 from graspd.service.model.planning import count_ranges, sum_outcomes
 from graspd.service.model.projects import EVERYTHING, ProjectScope
@@ -21,6 +24,11 @@ SHARE_DONE: Final[ColumnElement[float]] = case(
 )
 
 
+#: The shard of a task is reused if it is older than the task; both times are texts of one format.
+_REUSED: Final = and_(tasks.c.done, tasks.c.finished < tasks.c.created)
+JobSort = Literal["created", "hand", "object", "state", "duration"]
+
+
 class Jobs(database.IndexPart):
     def page(
         self,
@@ -29,25 +37,44 @@ class Jobs(database.IndexPart):
         hand: str | None = None,
         object: str | None = None,
         prefix: str = "",
+        words: Mapping[str, Collection[str]] = MappingProxyType({}),
+        sort: JobSort = "created",
+        descending: bool = True,
         limit: int = 50,
         cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[JobView]:
-        """Return a page of jobs, the newest first; `prefix` is the beginning of their ids."""
+        """Return a page of jobs, by default the newest first; `prefix` is the beginning of their ids.
+
+        Each of `words` occurs in hand, object or the name of a dataset, begins the id, or has ids of the owner.
+        """
+        order = _duration_s().label("duration") if sort == "duration" else jobs.c[sort]
+        query = select(jobs, *([order] if sort == "duration" else []))
         same = _equality_conditions({jobs.c.state: state, jobs.c.hand: hand, jobs.c.object: object})
-        query, key = select(jobs).where(*database.scope_conditions(scope, jobs), *same), (jobs.c.created, jobs.c.id)
+        query = query.where(*database.scope_conditions(scope, jobs), *same)
         query = query.where(jobs.c.id.startswith(prefix, autoescape=True)) if prefix else query
+        query = query.where(*(_contains_word(word, owners) for word, owners in words.items()))
+        page = {"limit": limit, "cursor": cursor, "descending": descending}
         with self.database.read_transaction() as connection:
-            rows, following = database.page_rows(connection, query, *key, limit=limit, cursor=cursor)
+            rows, following = database.page_rows(connection, query, order, jobs.c.id, **page)
             return Page(items=_job_views(connection, rows), next=following)
 
-    def get(self, job_id: str, *, scope: ProjectScope = EVERYTHING) -> JobView:
+    def get(self, job_id: str, *, details: bool = False, scope: ProjectScope = EVERYTHING) -> JobView:
+        """Return a job; with `details`, and if it found too few grasps, also outcomes, phases and times."""
         with self.database.read_transaction() as connection:
             query = select(jobs).where(jobs.c.id == job_id, *database.scope_conditions(scope, jobs))
             (view,) = _job_views(connection, [self.database.first_row(query, f"job {job_id!r}", connection)])
-            if view.note is None:
+            if view.note is None and not details:
                 return view
-            return view.model_copy(update={"outcomes": outcomes_of(connection, tasks.c.job_id == job_id)})
+            own = tasks.c.job_id == job_id
+            phases, outcomes = Counter[str](), []
+            for info in connection.scalars(_shard_info_query(shards.c.manifest["info"], own)):
+                outcomes.append(info.get("outcomes") or {})
+                phases.update({name[:-8]: value for name, value in info.items() if name.endswith("_seconds")})
+            used = select(tasks.c.device, func.sum(tasks.c.seconds)).where(own, tasks.c.done, not_(_REUSED))
+            seconds = {str(device): float(spent or 0) for device, spent in connection.execute(used.group_by("device"))}
+            found = {"outcomes": sum_outcomes(outcomes), "phases": dict(phases), "seconds_by_device": seconds}
+            return view.model_copy(update=found)
 
     def unfinished(self, ids: Collection[str]) -> set[str]:
         query = select(jobs.c.id).where(jobs.c.finished.is_(None))
@@ -74,6 +101,29 @@ class Jobs(database.IndexPart):
         return [AttemptView(**row) for row in self.database.rows(query)]
 
 
+def _contains_word(word: str, owners: Collection[str]) -> ColumnElement[bool]:
+    of_datasets = select(dataset_cells.c.job_id).where(dataset_cells.c.dataset.icontains(word, autoescape=True))
+    named = (column.icontains(word, autoescape=True) for column in (jobs.c.hand, jobs.c.object))
+    begins = jobs.c.id.startswith(word.lower(), autoescape=True)
+    return or_(begins, *named, jobs.c.id.in_(of_datasets), jobs.c.owner.in_(owners))
+
+
+class _duration_s(FunctionElement[float]):  # noqa: N801
+    """Time from the submission of a job to its end, or until now [s]."""
+
+    type, inherit_cache = Float(), True
+
+
+@compiles(_duration_s, "sqlite")
+def _sqlite_duration(element: Any, compiler: Any, **_: Any) -> str:
+    return "(julianday(coalesce(jobs.finished, 'now')) - julianday(jobs.created)) * 86400.0"
+
+
+@compiles(_duration_s, "postgresql")
+def _postgresql_duration(element: Any, compiler: Any, **_: Any) -> str:
+    return "extract(epoch from coalesce(jobs.finished::timestamptz, now()) - jobs.created::timestamptz)::float"
+
+
 def _equality_conditions(wanted: Mapping[Column[Any], str | None]) -> list[ColumnElement[bool]]:
     return [column == value for column, value in wanted.items() if value is not None]
 
@@ -97,15 +147,13 @@ def _with_pending_tasks(stage: StageProgress, tasks: int) -> StageProgress:
 
 
 def _stage_progress_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, list[StageProgress]]:
-    # The shard of a task is reused if it is older than the task; both times are texts of one format.
-    reused = and_(tasks.c.done, tasks.c.finished < tasks.c.created)
     group = (tasks.c.job_id, tasks.c.position, tasks.c.stage, tasks.c.state)
     query = select(
         *group,
         func.count().label("tasks"),
         func.sum(cast(SHARE_DONE, Float)).label("done"),
-        func.sum(case((reused, 0.0), else_=func.coalesce(tasks.c.seconds, 0.0))).label("seconds"),
-        func.sum(case((reused, 1), else_=0)).label("reused"),
+        func.sum(case((_REUSED, 0.0), else_=func.coalesce(tasks.c.seconds, 0.0))).label("seconds"),
+        func.sum(case((_REUSED, 1), else_=0)).label("reused"),
     )
     query = query.where(tasks.c.job_id.in_(ids)).group_by(*group)
     stages: dict[str, dict[int, dict[str, Any]]] = defaultdict(dict)
@@ -140,9 +188,13 @@ MOST_SHARDS: Final = 1000
 
 def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[str, int]:
     """Count rejected candidates by outcome in at most `MOST_SHARDS` shards of the selected jobs."""
-    query = select(shards.c.manifest["info"]["outcomes"]).join(tasks, tasks.c.shard_id == shards.c.id)
-    query = query.where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value).limit(MOST_SHARDS)
-    return sum_outcomes(one for one in connection.scalars(query) if isinstance(one, dict))
+    found = connection.scalars(_shard_info_query(shards.c.manifest["info"]["outcomes"], of_jobs))
+    return sum_outcomes(one for one in found if isinstance(one, dict))
+
+
+def _shard_info_query(part: ColumnElement[Any], of_jobs: ColumnElement[bool]) -> Select[Any]:
+    query = select(part).join(tasks, tasks.c.shard_id == shards.c.id)
+    return query.where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value).limit(MOST_SHARDS)
 
 
 class Shards(database.IndexPart):

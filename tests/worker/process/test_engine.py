@@ -106,7 +106,8 @@ def test_a_lease_that_was_taken_is_not_made_again(start: Start) -> None:
     worker.queue.release(lease)
     until(lambda: worker.states() == ["idle"], "the task stops")
     assert worker.queue.leases() == [] and worker.events()[-1] is EventKind.STARTED, "it is another's now"
-    assert [key for key in worker.queue.connection.keys("*") if TASK.task_id.encode() in key] == []
+    left = [key for key in worker.queue.connection.keys("*") if TASK.task_id.encode() in key]
+    assert left == [f"graspd:log:{TASK.task_id}-1".encode()]
 
 
 def test_a_lease_is_kept_while_the_engine_lets_nothing_else_run(start: Start) -> None:
