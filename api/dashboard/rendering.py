@@ -18,13 +18,25 @@ _HERE: Final = Path(__file__).parent
 STATIC: Final = _HERE / "static"
 NAVIGATION: Final = (
     ("/", "Home"),
+    ("/jobs", "Jobs"),
     ("/datasets", "Datasets"),
     ("/grasps", "Grasps"),
     ("/hands", "Hands"),
+    ("/objects", "Objects"),
     ("/workers", "Workers"),
     ("/chart", "Chart"),
     ("/stability", "Stability"),
 )
+#: Keyboard shortcuts of pages.
+KEYS: Final = {
+    "/jobs": "j",
+    "/datasets": "d",
+    "/grasps": "g",
+    "/hands": "h",
+    "/objects": "o",
+    "/workers": "w",
+    "/submit": "n",
+}
 #: Pages shown only if requests need a key: usage belongs to the projects of keys.
 _WITH_KEYS: Final = (("/usage", "Usage"),)
 
@@ -48,12 +60,14 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
     context = defaults | context
     context |= {
         "navigation": NAVIGATION if request.app.state.keys.is_open else NAVIGATION + _WITH_KEYS,
+        "keys": KEYS,
         "version": PACKAGE_VERSION,
         "signed_in": not request.app.state.keys.is_open,
         # Actions that the key does not permit have no button; routes also refuse them.
         "may_submit": is_allowed(request, Scope.SUBMIT),
         "may_change": may_change,
         "grace_s": request.app.state.settings.shard_grace_s,
+        "price_unit": request.app.state.settings.price_unit,
     }
     text = request.app.state.templates.get_template(template).render(context)
     text = add_prefix(text, request.app.state.settings.api_root_path or "")

@@ -22,7 +22,6 @@ from typing import Any, Final, TypeVar
 from pydantic_core import from_json
 from sqlalchemy import (
     URL,
-    Column,
     ColumnElement,
     Connection,
     Engine,

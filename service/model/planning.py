@@ -260,6 +260,12 @@ def sum_outcomes(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     return {name: int(count) for name, count in found.items() if count}
 
 
+def phase_seconds(info: Mapping[str, Any]) -> dict[str, float]:
+    """Return the time of each phase [s] in the `info` of a manifest: planner, validation, quality."""
+    times = ((key.removesuffix("_seconds"), value) for key, value in info.items() if key.endswith("_seconds"))
+    return {name: value for name, value in times if isinstance(value, int | float)}
+
+
 def format_outcomes(outcomes: Mapping[str, int]) -> str:
     order = sorted(outcomes.items(), key=lambda pair: -pair[1])
     return ", ".join(f"{count:,} {OUTCOMES.get(name, name.replace('_', ' '))}" for name, count in order if count)

@@ -3,7 +3,7 @@
 Over a pipe the worker (`worker.process.main`) first sends a `Setup`, then orders of the form (name, argument).
 `service` compares store and Redis. `check` is answered by `ready`, `task` by `done` and then `idle`; `end` ends the
 process. `refused`, with an error, may replace any answer. `stop` with a reason is accepted at any time. The engine also
-sends `facts` for the list of workers (including progress), `event`, and the `log` of the task. It does not access Redis."""
+sends `facts` for the list of workers (including progress), `event`, and the task's `log`. It does not access Redis."""
 
 from __future__ import annotations
 
@@ -221,7 +221,8 @@ class TaskResources:
         stage, chosen = raw.get("stage", ""), self.settings
         device = "cpu" if stage == Stage.INGEST else self._device.resolve()
         run = ExecutionContext(device, chosen.threads, prefilter=chosen.prefilter, pool=self.pool(stage))
-        return TaskContext(self.store, run, join=self._join if stage == Stage.SYNTHESIZE else 1, tell=tell, log=log.text)
+        join = self._join if stage == Stage.SYNTHESIZE else 1
+        return TaskContext(self.store, run, join=join, tell=tell, log=log.text)
 
 
 def resident_mb(pid: int | None = None) -> float:

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from graspd.service.model import errors, messages, names
 from graspd.service.model.clock import timestamp
+from graspd.service.model.planning import format_outcomes, phase_seconds
 from graspd.service.model.records import AttemptRecord
 from graspd.service.model.renamed import convert_names
 from graspd.service.model.states import Stage
@@ -89,10 +90,18 @@ class Runner:
         self._publish(self._create_event(EventKind.STARTED, message))
         clock = time.perf_counter()
         lost = self._lost_manifest(message, context)
+        if isinstance(message, messages.TaskMessage):
+            what = (
+                f"batch {message.batch}, {message.count} grasps of {message.request.hand} on {message.request.object}"
+            )
+            log.info("%s starts: %s, on %s", message.stage, what, context.device)
         made = self._stages[message.stage](message, context)
         self._check_device(context.device)
         seconds = time.perf_counter() - clock
         if made is not None and isinstance(message, messages.TaskMessage):
+            phases = [f"{name} {time_s:.2f} s" for name, time_s in phase_seconds(made.info).items()]
+            rejected = format_outcomes(made.info.get("outcomes", {}))
+            log.info("computed in %.2f s; %s", seconds, "; ".join([*phases, f"rejected: {rejected or 'none'}"]))
             context.check()
             device, worker = context.device, self._worker
             made = replace(made, info={**made.info, "log": context.log()})

@@ -12,7 +12,7 @@ from sqlalchemy.sql.functions import FunctionElement
 from graspd.service.index import database
 from graspd.service.index.tables import attempts, dataset_cells, jobs, shards, tasks
 from graspd.service.index.views import AttemptView, JobView, Page, ShardView, StageProgress, TaskView
-from graspd.service.model.planning import count_ranges, sum_outcomes
+from graspd.service.model.planning import count_ranges, phase_seconds, sum_outcomes
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.states import Stage, State
 
@@ -54,9 +54,10 @@ class Jobs(database.IndexPart):
         query = query.where(*database.scope_conditions(scope, jobs), *same)
         query = query.where(jobs.c.id.startswith(prefix, autoescape=True)) if prefix else query
         query = query.where(*(_contains_word(word, owners) for word, owners in words.items()))
-        page = {"limit": limit, "cursor": cursor, "descending": descending}
         with self.database.read_transaction() as connection:
-            rows, following = database.page_rows(connection, query, order, jobs.c.id, **page)
+            rows, following = database.page_rows(
+                connection, query, order, jobs.c.id, limit=limit, cursor=cursor, descending=descending
+            )
             return Page(items=_job_views(connection, rows), next=following)
 
     def get(self, job_id: str, *, details: bool = False, scope: ProjectScope = EVERYTHING) -> JobView:
@@ -70,7 +71,7 @@ class Jobs(database.IndexPart):
             phases, outcomes = Counter[str](), []
             for info in connection.scalars(_shard_info_query(shards.c.manifest["info"], own)):
                 outcomes.append(info.get("outcomes") or {})
-                phases.update({name[:-8]: value for name, value in info.items() if name.endswith("_seconds")})
+                phases.update(phase_seconds(info))
             used = select(tasks.c.device, func.sum(tasks.c.seconds)).where(own, tasks.c.done, not_(_REUSED))
             seconds = {str(device): float(spent or 0) for device, spent in connection.execute(used.group_by("device"))}
             found = {"outcomes": sum_outcomes(outcomes), "phases": dict(phases), "seconds_by_device": seconds}
