@@ -77,6 +77,9 @@ class Overview:
         except errors.NotFoundError:
             return None
 
+    def names(self, text: str, *, limit: int) -> list[tuple[str, str]]:
+        return self._services.index.overview.names(text, limit=limit, scope=project_scope())
+
     def stats(self) -> Stats:
         return self._services.index.overview.stats(scope=project_scope())
 

@@ -1,6 +1,6 @@
 """List of jobs: search, order, saved views, and changes of many jobs."""
 
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 from urllib.parse import parse_qsl, quote, unquote, urlencode
 
 from fastapi import APIRouter, Form, Request
@@ -23,7 +23,6 @@ _VIEWS_COOKIE: Final = "graspd_views"
 _MOST_VIEWS: Final = 12
 _VIEW_CHARACTERS: Final = 200
 _DONE: Final = {"cancel": "cancelled", "retry": "queued again", "delete": "deleted"}
-Action = Literal["cancel", "retry", "delete"]
 
 router = APIRouter(prefix="/jobs", include_in_schema=False)
 

@@ -110,19 +110,19 @@ def _contains_word(word: str, owners: Collection[str]) -> ColumnElement[bool]:
 
 
 class _duration_s(FunctionElement[float]):  # noqa: N801
-    """Time from the submission of a job to its end, or until now [s]."""
+    """Time from the submission of a job to its end [s]; unfinished jobs come after all others, the oldest last."""
 
     type, inherit_cache = Float(), True
 
 
 @compiles(_duration_s, "sqlite")
 def _sqlite_duration(element: Any, compiler: Any, **_: Any) -> str:
-    return "(julianday(coalesce(jobs.finished, 'now')) - julianday(jobs.created)) * 86400.0"
+    return "(julianday(coalesce(jobs.finished, '9999-01-01')) - julianday(jobs.created)) * 86400.0"
 
 
 @compiles(_duration_s, "postgresql")
 def _postgresql_duration(element: Any, compiler: Any, **_: Any) -> str:
-    return "extract(epoch from coalesce(jobs.finished::timestamptz, now()) - jobs.created::timestamptz)::float"
+    return "extract(epoch from coalesce(jobs.finished, '9999-01-01')::timestamptz - jobs.created::timestamptz)::float"
 
 
 def _equality_conditions(wanted: Mapping[Column[Any], str | None]) -> list[ColumnElement[bool]]:
