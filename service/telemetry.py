@@ -45,7 +45,7 @@ def set_up_logs(settings: Settings, process: str = "graspd") -> None:
     """Write the log of this process to stderr; `process` is its name in JSON lines."""
     is_text = settings.log_format == "text" or (settings.log_format == "auto" and sys.stderr.isatty())
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(TextFormatter() if is_text else JsonFormatter(process))
+    handler.setFormatter(_TextFormatter() if is_text else JsonFormatter(process))
     logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)
     logging.captureWarnings(True)
     for name in _TALKATIVE:
@@ -75,16 +75,9 @@ class JsonFormatter(logging.Formatter):
         return without_secrets(json.dumps(line, default=str, ensure_ascii=False))
 
 
-class TextFormatter(logging.Formatter):
-    """One line per record, without secrets: time, level, logger, message, and the subjects."""
-
-    def __init__(self, *, with_subjects: bool = True) -> None:
-        super().__init__()
-        self._with_subjects = with_subjects
-
+class _TextFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
-        subjects = _subjects(record) if self._with_subjects else {}
-        about = " ".join(f"{name}={value}" for name, value in subjects.items())
+        about = " ".join(f"{name}={value}" for name, value in _subjects(record).items())
         trace = f"\n{self.formatException(record.exc_info)}" if record.exc_info else ""
         message = record.getMessage().translate(_OBEYED)
         text = f"{_format_time(record)[11:23]} {record.levelname} {record.name} {message}"

@@ -53,10 +53,6 @@ class Assets:
         """Return the names of the datasets that use each hand or object."""
         return self._services.index.datasets.users_of(digests, scope=project_scope())
 
-    def sets_of(self, name: str) -> list[str]:
-        sets = self._services.index.object_sets.newest_versions(scope=project_scope())
-        return [one.name for one in sets if name in one.objects]
-
     def files(self, asset: AssetView) -> Mapping[str, bytes]:
         return library.load_asset_files(self._services.store, asset.kind, asset.digest)
 

@@ -5,8 +5,7 @@ import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any, Final, Literal
 
@@ -26,7 +25,6 @@ from graspd.service.model.errors import (
     NotFoundError,
     UnavailableError,
 )
-from graspd.service.model.planning import phase_seconds
 from graspd.service.model.records import AttemptRecord
 from graspd.service.model.states import Stage, State
 from graspd.service.pipeline import deletion, job_actions
@@ -43,8 +41,6 @@ log = logging.getLogger(__name__)
 _PAGE: Final = 200
 #: Number of waiting tasks that are searched for a reason to wait.
 _LOOKED_AT: Final = 20
-_TASKS_SHOWN: Final = 50
-_KEPT_ESTIMATES: Final = 200
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _SHARED: Final = Job.model_fields.keys() & JobView.model_fields.keys() - {"reason", "stages"}
 _DETAILS: Final = JobDetail.model_fields.keys() & JobView.model_fields.keys() - Job.model_fields.keys() | {"note"}
@@ -99,16 +95,6 @@ def _shard_model(shard: ShardView) -> Shard:
     return Shard(**shard.model_dump(), file=f"/v1/shards/{shard.id}/file")
 
 
-@dataclass(frozen=True)
-class TaskHistory:
-    """A task with its log, the times of its phases [s], and its failed attempts, newest first."""
-
-    task: TaskView
-    log: str
-    phases: Mapping[str, float]
-    attempts: Sequence[AttemptRecord]
-
-
 class Jobs:
     """Jobs in the caller's scope; changes can raise ForeignResource (another owner) and QuotaError."""
 
@@ -121,8 +107,6 @@ class Jobs:
         self._grasps = grasps
         self._shards = shards
         self._paces = TaskRates()
-        self._estimates: dict[str, Estimate] = {}
-        self._lock = threading.Lock()
 
     def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
         """Record a job, or return the existing identical job."""
@@ -140,24 +124,18 @@ class Jobs:
         return self._job_detail(job).model_copy(update={"choice": record.choice or job.choice})
 
     def cancel(self, job_id: str) -> JobDetail:
-        return self._job_detail(self._cancel(job_id))
-
-    def _cancel(self, job_id: str) -> JobView:
         self._get_owned(job_id)
         with bind_subjects(job=job_id):
             job = job_actions.cancel(self._services, job_id)
             log.info("job cancelled")
-        return job
+        return self._job_detail(job)
 
     def retry(self, job_id: str) -> JobDetail:
-        return self._job_detail(self._retry(job_id))
-
-    def _retry(self, job_id: str) -> JobView:
         grasps = self._get_owned(job_id).request.grasps
         with bind_subjects(job=job_id), self._quotas.claim(caller.get(), job_id, grasps, is_new=False):
             job = job_actions.retry(self._services, job_id)
             log.info("job retried")
-        return job
+        return self._job_detail(job)
 
     def delete(self, job_id: str) -> None:
         self._get_owned(job_id)
@@ -193,7 +171,7 @@ class Jobs:
     def change(self, action: str, job_ids: Iterable[str]) -> tuple[int, list[str]]:
         """Cancel, retry or delete jobs; return the number of changed ones, and why others were not."""
         acts: dict[str, Callable[[str], object]]
-        acts = {"cancel": self._cancel, "retry": self._retry, "delete": self.delete}
+        acts = {"cancel": self.cancel, "retry": self.retry, "delete": self.delete}
         changed, problems = 0, []
         for job_id in job_ids:
             try:
@@ -203,37 +181,30 @@ class Jobs:
                 problems.append(str(error))
         return changed, problems
 
-    def tasks(self, job_id: str, *, limit: int = _TASKS_SHOWN) -> list[TaskView]:
-        """Return the first tasks of a job: running ones, then failed, waiting, cancelled and succeeded ones."""
-        found: list[TaskView] = []
-        for state in (State.RUNNING, State.FAILED, State.QUEUED, State.CANCELLED, State.SUCCEEDED):
-            if len(found) < limit:
-                found += self._services.index.jobs.tasks(job=job_id, state=state, limit=limit - len(found)).items
-        return found
+    def tasks(self, job_id: str, *, limit: int = 50) -> list[TaskView]:
+        """Return the first tasks of a job: running ones, then failed ones, then others by batch."""
+        tasks = partial(self._services.index.jobs.tasks, job=job_id, limit=limit)
+        found = [task for state in (State.RUNNING, State.FAILED, None) for task in tasks(state=state).items]
+        return list({task.id: task for task in found}.values())[:limit]
 
-    def task(self, job_id: str, task_id: str) -> TaskHistory:
-        task = self._services.index.jobs.task(task_id, scope=project_scope())
+    def task(self, job_id: str, task_id: str) -> tuple[TaskView, dict[str, Any], list[AttemptRecord]]:
+        """Return a task, the `info` of its manifest (else only its log so far), and its failed attempts."""
+        task, info = self._services.index.jobs.task(task_id, scope=project_scope()), dict[str, Any]()
         if task.job_id != job_id:
             raise NotFoundError(f"job {job_id} has no task {task_id!r}")
-        log, info = "", dict[str, Any]()
         with contextlib.suppress(UnavailableError, NotFoundError, DamagedError):
+            info = {"log": self._services.queue.task_log(rq_id(task.id, task.attempt))}
             if task.state is State.SUCCEEDED:
-                info = load_manifest(self._services.store, task.stage, task.shard_id).info
-                log = str(info.get("log", ""))
-            else:
-                log = self._services.queue.task_log(rq_id(task.id, task.attempt))
-        return TaskHistory(task, log, phase_seconds(info), task_attempts(self._services.store, task.id)[::-1])
+                info |= load_manifest(self._services.store, task.stage, task.shard_id).info
+        return task, info, task_attempts(self._services.store, task.id)[::-1]
 
     def estimate(self, job: JobDetail) -> Estimate | None:
-        """Estimate a job's cost from the tasks that were finished before it was submitted; None if unknown."""
-        costs = partial(self._services.index.costs.batch_costs, limit=_PAGE, before=job.created, scope=project_scope())
-        with self._lock, contextlib.suppress(ValidationError, GraspdError):
-            if job.id not in self._estimates:
-                options = {name: getattr(job.request, name) for name in JobOptions.model_fields}
-                matrix = Matrix(hands=(job.hand,), objects=(job.object,), **options)
-                found = estimate(self._services.index, matrix, costs=costs, scope=project_scope())
-                self._estimates = {**dict(list(self._estimates.items())[-_KEPT_ESTIMATES:]), job.id: found}
-            return self._estimates[job.id]
+        """Estimate a job's cost from the last tasks that were finished before its submission; None if unknown."""
+        costs = partial(self._services.index.costs.batch_costs, limit=64, before=job.created, scope=project_scope())
+        options = {name: getattr(job.request, name) for name in JobOptions.model_fields}
+        with contextlib.suppress(ValidationError, GraspdError):
+            matrix = Matrix(hands=(job.hand,), objects=(job.object,), **options)
+            return estimate(self._services.index, matrix, costs=costs, scope=project_scope())
         return None
 
     def _get_owned(self, job_id: str) -> JobView:

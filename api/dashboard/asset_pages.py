@@ -17,7 +17,7 @@ from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf
 from graspd.service.index.views import AssetView
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.states import AssetKind
-from graspd.service.store.asset_summary import fact_rows, hand_line, payload_line, self_test_line
+from graspd.service.store.asset_summary import hand_line, payload_line, self_test_line
 from graspd.service.store.assets import BUILTIN_LICENCE
 from graspd.service.store.descriptions import MAX_ENTRIES, HandFacts
 
@@ -95,9 +95,8 @@ def object_page(request: Request, name: str, assets: AssetsOf) -> HTMLResponse:
         poll_s=0 if checked else _CHECK_S,
         object=found,
         checked=checked,
-        facts=[*fact_rows(found.kind, found.facts), _short_facts(assets, found)[-1]],
+        facts=_short_facts(assets, found),
         datasets=assets.datasets_of([found.digest])[found.digest],
-        sets=assets.sets_of(found.name),
     )
 
 

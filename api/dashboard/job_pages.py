@@ -1,9 +1,8 @@
 """Page of a job: stages, cost, rejections, best grasps, tasks, files; page of a task; pictures as PNG or thumbnail."""
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import lru_cache, partial
-from operator import itemgetter
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
@@ -18,7 +17,7 @@ from graspd.api.dashboard.rendering import base_url, render
 from graspd.api.models import GraspQuery, JobDetail
 from graspd.api.routes.dependencies import READ, GraspsOf, JobsOf, ShardsOf, TagsOf
 from graspd.service.model.errors import NotFoundError
-from graspd.service.model.planning import OUTCOMES
+from graspd.service.model.planning import OUTCOMES, phase_seconds
 from graspd.service.settings import Settings
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import open_shard
@@ -47,8 +46,7 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         refresh_s=0 if job.state.is_final else 3,
         job=job,
         tasks=jobs.tasks(job_id),
-        rejected=[(OUTCOMES.get(name, name), number) for name, number in by_size(job.outcomes)],
-        phases=by_size(job.phases),
+        rejected={OUTCOMES.get(name, name): number for name, number in job.outcomes.items()},
         reused=sum(stage.reused for stage in job.stages),
         task_count=sum(stage.tasks for stage in job.stages),
         expected=jobs.estimate(job),
@@ -77,8 +75,8 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
 @router.get("/jobs/{job_id}/tasks/{task_id}", dependencies=READ)
 def task_page(request: Request, job_id: str, task_id: str, jobs: JobsOf) -> HTMLResponse:
     """Show a task with the log of its worker, its phases and its failed attempts."""
-    job, found = jobs.get_progress(job_id), jobs.task(job_id, task_id)
-    ended = found.task.state.is_final
+    job, (task, info, attempts) = jobs.get_progress(job_id), jobs.task(job_id, task_id)
+    ended = task.state.is_final
     return render(
         request,
         "task.html",
@@ -86,15 +84,11 @@ def task_page(request: Request, job_id: str, task_id: str, jobs: JobsOf) -> HTML
         events="" if ended else f"/v1/jobs/{job.id}/events",
         refresh_s=0 if ended else 3,
         job=job,
-        task=found.task,
-        log=found.log,
-        phases=by_size(found.phases),
-        attempts=found.attempts,
+        task=task,
+        log=info.get("log", ""),
+        phases=phase_seconds(info),
+        attempts=attempts,
     )
-
-
-def by_size(numbers: Mapping[str, float]) -> list[tuple[str, float]]:
-    return sorted(numbers.items(), key=itemgetter(1), reverse=True)
 
 
 def _cost_of(settings: Settings, job: JobDetail) -> dict[str, float]:

@@ -28,15 +28,7 @@ NAVIGATION: Final = (
     ("/stability", "Stability"),
 )
 #: Keyboard shortcuts of pages.
-KEYS: Final = {
-    "/jobs": "j",
-    "/datasets": "d",
-    "/grasps": "g",
-    "/hands": "h",
-    "/objects": "o",
-    "/workers": "w",
-    "/submit": "n",
-}
+KEYS: Final = {f"/{page}": page[0] for page in ("jobs", "datasets", "grasps", "hands", "objects", "workers")}
 #: Pages shown only if requests need a key: usage belongs to the projects of keys.
 _WITH_KEYS: Final = (("/usage", "Usage"),)
 

@@ -260,10 +260,11 @@ def sum_outcomes(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     return {name: int(count) for name, count in found.items() if count}
 
 
-def phase_seconds(info: Mapping[str, Any]) -> dict[str, float]:
-    """Return the time of each phase [s] in the `info` of a manifest: planner, validation, quality."""
-    times = ((key.removesuffix("_seconds"), value) for key, value in info.items() if key.endswith("_seconds"))
-    return {name: value for name, value in times if isinstance(value, int | float)}
+def phase_seconds(*infos: Mapping[str, Any]) -> dict[str, float]:
+    """Return the time of each phase [s] in the `info` of manifests: planner, validation, quality."""
+    times = [(name[:-8], value) for info in infos for name, value in info.items() if name.endswith("_seconds")]
+    times = [(name, value) for name, value in times if isinstance(value, int | float)]
+    return {name: sum(value for one, value in times if one == name) for name in dict(times)}
 
 
 def format_outcomes(outcomes: Mapping[str, int]) -> str:

@@ -27,13 +27,8 @@ def verdict_line(asset: Mapping[str, Any]) -> str:
 
 
 def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
-    return [f"{label:<18} {text}" for label, text in fact_rows(kind, facts)]
-
-
-def fact_rows(kind: AssetKind, facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return labels and texts of the facts of an asset."""
-    rows = {AssetKind.HAND: _hand_rows, AssetKind.OBJECT: _object_rows, AssetKind.NETWORK: _network_rows}[kind]
-    return list(rows(facts))
+    pairs = {AssetKind.HAND: _hand_rows, AssetKind.OBJECT: _object_rows, AssetKind.NETWORK: _network_rows}[kind](facts)
+    return [f"{label:<18} {text}" for label, text in pairs]
 
 
 def self_test_line(facts: Mapping[str, Any]) -> str:

@@ -346,6 +346,20 @@ def test_why_a_job_found_little_is_seen_in_three_clicks(page: Any, services: Ser
     assert hand.clicks <= 3
 
 
+def test_a_view_of_the_list_is_saved_shown_and_removed(page: Any, services: Services) -> None:
+    fail(services, add_job(services), "a reason")
+    page.goto("/jobs?state=failed&q=mug")
+    page.fill("[name=view]", "my failures")
+    page.keyboard.press("Enter")
+    page.goto("/jobs")
+    page.click("#view-names >> text=my failures")
+    page.wait_for_url("**/jobs?state=failed&q=mug")
+    assert page.get_attribute("#view-names a", "aria-current") == "true"
+    page.fill("[name=view]", "my failures")
+    page.click("text=Save this view")
+    assert page.locator("#view-names a").count() == 0
+
+
 def test_a_log_grows_on_the_page_of_its_task(page: Any, services: Services) -> None:
     job = add_job(services)
     task = next(plan_tasks(job))

@@ -90,11 +90,6 @@ class Runner:
         self._publish(self._create_event(EventKind.STARTED, message))
         clock = time.perf_counter()
         lost = self._lost_manifest(message, context)
-        if isinstance(message, messages.TaskMessage):
-            what = (
-                f"batch {message.batch}, {message.count} grasps of {message.request.hand} on {message.request.object}"
-            )
-            log.info("%s starts: %s, on %s", message.stage, what, context.device)
         made = self._stages[message.stage](message, context)
         self._check_device(context.device)
         seconds = time.perf_counter() - clock

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from graspd.service.telemetry import TextFormatter
+from graspd.service.model.errors import without_secrets
 
 #: Limits on a log: its last lines are kept, and a long line is cut.
 LINES: Final = 200
@@ -16,19 +16,19 @@ _SEND_EVERY_S: Final = 1.0
 
 
 class TaskLog(logging.Handler):
-    """Handler that keeps the log lines of this process while a task runs, and lines about its progress."""
+    """Handler that keeps the last log lines of this process while a task runs, and lines about its progress."""
 
     def __init__(self, send: Callable[[str, str], None]) -> None:
         """`send` receives the task's RQ id and the whole log, at most once a second and at the end."""
         super().__init__()
-        self.setFormatter(TextFormatter(with_subjects=False))
-        self._send, self._lines, self._dropped = send, deque[str](maxlen=LINES), 0
-        self._task, self._due, self._noted = "", 0.0, ("", -1)
+        self.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s %(message)s"))
+        self._send, self._lines = send, deque[str](maxlen=LINES)
+        self._task, self._due, self._noted = "", 0.0, ("", 0)
 
     @contextmanager
     def of_task(self, task: str) -> Iterator[None]:
         self._lines.clear()
-        self._task, self._dropped, self._due, self._noted = task, 0, 0.0, ("", -1)
+        self._task, self._due, self._noted = task, 0.0, ("", 0)
         logging.getLogger().addHandler(self)
         try:
             yield
@@ -37,9 +37,7 @@ class TaskLog(logging.Handler):
             self._send(task, self.text())
 
     def emit(self, record: logging.LogRecord) -> None:
-        for line in self.format(record).splitlines():
-            self._dropped += len(self._lines) == LINES
-            self._lines.append(line[:LINE_CHARACTERS])
+        self._lines.extend(line[:LINE_CHARACTERS] for line in without_secrets(self.format(record)).splitlines())
         if time.monotonic() >= self._due:
             self._due = time.monotonic() + _SEND_EVERY_S
             self._send(self._task, self.text())
@@ -49,9 +47,7 @@ class TaskLog(logging.Handler):
         share = done / total if total else 0.0
         if self._noted != (noted := (message, int(10 * share))):
             self._noted = noted
-            text = f"{share:.0%} {message}"
-            self.handle(logging.LogRecord("progress", logging.INFO, "", 0, text, None, None))
+            self.handle(logging.LogRecord("progress", logging.INFO, "", 0, f"{share:.0%} {message}", None, None))
 
     def text(self) -> str:
-        dropped = [f"... {self._dropped} earlier lines"] if self._dropped else []
-        return "\n".join([*dropped, *self._lines])
+        return "\n".join(self._lines)

@@ -1,13 +1,12 @@
 """Queries of jobs, tasks, attempts and shards, and the outcomes of a job's candidates."""
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
-from sqlalchemy import Column, ColumnElement, Connection, Float, Select, and_, case, cast, func, not_, or_, select
-from sqlalchemy.ext.compiler import compiles
-from sqlalchemy.sql.functions import FunctionElement
+from sqlalchemy import Column, ColumnElement, Connection, Float, case, cast, func, literal_column, select
 
 from graspd.service.index import database
 from graspd.service.index.tables import attempts, dataset_cells, jobs, shards, tasks
@@ -25,7 +24,12 @@ SHARE_DONE: Final[ColumnElement[float]] = case(
 
 
 #: The shard of a task is reused if it is older than the task; both times are texts of one format.
-_REUSED: Final = and_(tasks.c.done, tasks.c.finished < tasks.c.created)
+_REUSED: Final = tasks.c.done & (tasks.c.finished < tasks.c.created)
+#: Order by the time from the submission of a job to its end; unfinished jobs count as ending last.
+_DURATION: Final = {
+    "sqlite": "julianday(coalesce(jobs.finished, '9999-01-01')) - julianday(jobs.created)",
+    "postgresql": "extract(epoch from coalesce(jobs.finished, '9999-01-01')::timestamptz - jobs.created::timestamptz)",
+}
 JobSort = Literal["created", "hand", "object", "state", "duration"]
 
 
@@ -48,16 +52,14 @@ class Jobs(database.IndexPart):
 
         Each of `words` occurs in hand, object or the name of a dataset, begins the id, or has ids of the owner.
         """
-        order = _duration_s().label("duration") if sort == "duration" else jobs.c[sort]
-        query = select(jobs, *([order] if sort == "duration" else []))
         same = _equality_conditions({jobs.c.state: state, jobs.c.hand: hand, jobs.c.object: object})
-        query = query.where(*database.scope_conditions(scope, jobs), *same)
+        query = select(jobs).where(*database.scope_conditions(scope, jobs), *same)
         query = query.where(jobs.c.id.startswith(prefix, autoescape=True)) if prefix else query
         query = query.where(*(_contains_word(word, owners) for word, owners in words.items()))
+        page = partial(database.page_rows, limit=limit, cursor=cursor, descending=descending)
         with self.database.read_transaction() as connection:
-            rows, following = database.page_rows(
-                connection, query, order, jobs.c.id, limit=limit, cursor=cursor, descending=descending
-            )
+            key: ColumnElement[Any] = jobs.c[sort] if sort != "duration" else _duration(connection)
+            rows, following = page(connection, query.add_columns(key) if sort == "duration" else query, key, jobs.c.id)
             return Page(items=_job_views(connection, rows), next=following)
 
     def get(self, job_id: str, *, details: bool = False, scope: ProjectScope = EVERYTHING) -> JobView:
@@ -68,13 +70,10 @@ class Jobs(database.IndexPart):
             if view.note is None and not details:
                 return view
             own = tasks.c.job_id == job_id
-            phases, outcomes = Counter[str](), []
-            for info in connection.scalars(_shard_info_query(shards.c.manifest["info"], own)):
-                outcomes.append(info.get("outcomes") or {})
-                phases.update(phase_seconds(info))
-            used = select(tasks.c.device, func.sum(tasks.c.seconds)).where(own, tasks.c.done, not_(_REUSED))
+            infos = _infos_of(connection, own)
+            used = select(tasks.c.device, func.sum(tasks.c.seconds)).where(own, tasks.c.done, ~_REUSED)
             seconds = {str(device): float(spent or 0) for device, spent in connection.execute(used.group_by("device"))}
-            found = {"outcomes": sum_outcomes(outcomes), "phases": dict(phases), "seconds_by_device": seconds}
+            found = {"outcomes": _sum_infos(infos), "phases": phase_seconds(*infos), "seconds_by_device": seconds}
             return view.model_copy(update=found)
 
     def unfinished(self, ids: Collection[str]) -> set[str]:
@@ -102,27 +101,15 @@ class Jobs(database.IndexPart):
         return [AttemptView(**row) for row in self.database.rows(query)]
 
 
+def _duration(connection: Connection) -> ColumnElement[float]:
+    return literal_column(_DURATION[connection.dialect.name], Float()).label("duration")
+
+
 def _contains_word(word: str, owners: Collection[str]) -> ColumnElement[bool]:
     of_datasets = select(dataset_cells.c.job_id).where(dataset_cells.c.dataset.icontains(word, autoescape=True))
-    named = (column.icontains(word, autoescape=True) for column in (jobs.c.hand, jobs.c.object))
+    named = jobs.c.hand.icontains(word, autoescape=True) | jobs.c.object.icontains(word, autoescape=True)
     begins = jobs.c.id.startswith(word.lower(), autoescape=True)
-    return or_(begins, *named, jobs.c.id.in_(of_datasets), jobs.c.owner.in_(owners))
-
-
-class _duration_s(FunctionElement[float]):  # noqa: N801
-    """Time from the submission of a job to its end [s]; unfinished jobs come after all others, the oldest last."""
-
-    type, inherit_cache = Float(), True
-
-
-@compiles(_duration_s, "sqlite")
-def _sqlite_duration(element: Any, compiler: Any, **_: Any) -> str:
-    return "(julianday(coalesce(jobs.finished, '9999-01-01')) - julianday(jobs.created)) * 86400.0"
-
-
-@compiles(_duration_s, "postgresql")
-def _postgresql_duration(element: Any, compiler: Any, **_: Any) -> str:
-    return "extract(epoch from coalesce(jobs.finished, '9999-01-01')::timestamptz - jobs.created::timestamptz)::float"
+    return named | begins | jobs.c.id.in_(of_datasets) | jobs.c.owner.in_(owners)
 
 
 def _equality_conditions(wanted: Mapping[Column[Any], str | None]) -> list[ColumnElement[bool]]:
@@ -189,13 +176,17 @@ MOST_SHARDS: Final = 1000
 
 def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[str, int]:
     """Count rejected candidates by outcome in at most `MOST_SHARDS` shards of the selected jobs."""
-    found = connection.scalars(_shard_info_query(shards.c.manifest["info"]["outcomes"], of_jobs))
-    return sum_outcomes(one for one in found if isinstance(one, dict))
+    return _sum_infos(_infos_of(connection, of_jobs))
 
 
-def _shard_info_query(part: ColumnElement[Any], of_jobs: ColumnElement[bool]) -> Select[Any]:
-    query = select(part).join(tasks, tasks.c.shard_id == shards.c.id)
-    return query.where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value).limit(MOST_SHARDS)
+def _infos_of(connection: Connection, of_jobs: ColumnElement[bool]) -> list[dict[str, Any]]:
+    query = select(shards.c.manifest["info"]).join(tasks, tasks.c.shard_id == shards.c.id)
+    query = query.where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value).limit(MOST_SHARDS)
+    return [info for info in connection.scalars(query) if isinstance(info, dict)]
+
+
+def _sum_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    return sum_outcomes(info.get("outcomes") or {} for info in infos)
 
 
 class Shards(database.IndexPart):
