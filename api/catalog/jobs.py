@@ -16,15 +16,8 @@ from graspd.api.access.quotas import Idempotency, Quotas
 from graspd.api.catalog.grasps import MEAN_METRICS, Grasps
 from graspd.api.models import Job, JobDetail, MeanMetrics, Shard, StageStatus, stage_state
 from graspd.service.index.views import JobView, Page, ShardView, StageProgress, TaskView
+from graspd.service.model import errors
 from graspd.service.model.domain import JobOptions, JobRequest
-from graspd.service.model.errors import (
-    ConflictError,
-    DamagedError,
-    GraspdError,
-    LimitError,
-    NotFoundError,
-    UnavailableError,
-)
 from graspd.service.model.records import AttemptRecord
 from graspd.service.model.states import Stage, State
 from graspd.service.pipeline import deletion, job_actions
@@ -177,7 +170,7 @@ class Jobs:
             try:
                 acts[action](job_id)
                 changed += 1
-            except (ConflictError, NotFoundError, ForeignResource, LimitError) as error:
+            except (errors.ConflictError, errors.NotFoundError, ForeignResource, errors.LimitError) as error:
                 problems.append(str(error))
         return changed, problems
 
@@ -191,8 +184,8 @@ class Jobs:
         """Return a task, the `info` of its manifest (else only its log so far), and its failed attempts."""
         task, info = self._services.index.jobs.task(task_id, scope=project_scope()), dict[str, Any]()
         if task.job_id != job_id:
-            raise NotFoundError(f"job {job_id} has no task {task_id!r}")
-        with contextlib.suppress(UnavailableError, NotFoundError, DamagedError):
+            raise errors.NotFoundError(f"job {job_id} has no task {task_id!r}")
+        with contextlib.suppress(errors.UnavailableError, errors.NotFoundError, errors.DamagedError):
             info = {"log": self._services.queue.task_log(rq_id(task.id, task.attempt))}
             if task.state is State.SUCCEEDED:
                 info |= load_manifest(self._services.store, task.stage, task.shard_id).info
@@ -202,7 +195,7 @@ class Jobs:
         """Estimate a job's cost from the last tasks that were finished before its submission; None if unknown."""
         costs = partial(self._services.index.costs.batch_costs, limit=64, before=job.created, scope=project_scope())
         options = {name: getattr(job.request, name) for name in JobOptions.model_fields}
-        with contextlib.suppress(ValidationError, GraspdError):
+        with contextlib.suppress(ValidationError, errors.GraspdError):
             matrix = Matrix(hands=(job.hand,), objects=(job.object,), **options)
             return estimate(self._services.index, matrix, costs=costs, scope=project_scope())
         return None

@@ -1,4 +1,4 @@
-"""Pages of hands and objects: the lists, an object in 3D, and a hand with a form to correct guesses about it."""
+"""Pages of hands and objects: lists, an object in 3D, a hand with a form to correct guesses."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -61,7 +61,7 @@ def _render_list(request: Request, assets: Assets, kind: AssetKind, cursor: str 
 
 
 def _short_facts(assets: Assets, asset: AssetView) -> list[tuple[str, str]]:
-    """Return labels and texts for the list. `facts` contains data from the upload, so values may be of any type."""
+    """Return labels and texts. `facts` contains data from the upload, so values may be of any type."""
     facts = asset.facts
     if asset.builtin and asset.kind is AssetKind.HAND:
         facts = _builtin_facts(assets, asset.digest) | facts

@@ -1,4 +1,4 @@
-"""Page of a job: stages, cost, rejections, best grasps, tasks, files; page of a task; pictures as PNG or thumbnail."""
+"""Pages of a job and of a task; pictures as PNG or thumbnail."""
 
 import io
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Log of the running task: bounded, without secrets, sent while the task runs and stored with its attempt."""
+"""Log of the running task: bounded, without secrets, sent while the task runs."""
 
 import logging
 import time
@@ -16,7 +16,7 @@ _SEND_EVERY_S: Final = 1.0
 
 
 class TaskLog(logging.Handler):
-    """Handler that keeps the last log lines of this process while a task runs, and lines about its progress."""
+    """Handler that keeps the last log lines of a running task, and lines about its progress."""
 
     def __init__(self, send: Callable[[str, str], None]) -> None:
         """`send` receives the task's RQ id and the whole log, at most once a second and at the end."""

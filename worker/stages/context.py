@@ -50,7 +50,7 @@ class TaskContext:
         tell: Callable[[float, float, str], None] | None = None,
         log: Callable[[], str] = str,
     ) -> None:
-        """`join`: batches planned in one launch; `tell`: receives done, total and a message; `log`: log so far."""
+        """`join`: batches per launch; `tell`: receives done, total and a message; `log`: log so far."""
         self.store, self.device, self.join = store, run.device, join
         self.run = replace(run, progress=self.progress, cancelled=self.cancelled)  # execution context for the engine
         self._tell, self._tell_again, self.log = tell, 0.0, log

@@ -31,7 +31,7 @@ class Overview(IndexPart):
         return [WorkerView(**row) for row in self.database.rows(query)]
 
     def names(self, text: str, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[tuple[str, str]]:
-        """Return kind and name of datasets, assets and tags with a text in their names, at most `limit` of each."""
+        """Return kind and name of datasets, assets and tags whose names contain a text."""
         sources = (
             (literal("dataset"), datasets.c.name, scope_conditions(scope, datasets)),
             (assets.c.kind, assets.c.name, asset_scope_conditions(scope)),
