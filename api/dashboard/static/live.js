@@ -86,26 +86,21 @@
     const found = answer.ok && new DOMParser().parseFromString(await answer.text(), "text/html").getElementById("results");
     if (found && number === asked) palette.querySelector("ul").replaceChildren(...found.children);
   }
-  function open(id) {
-    document.getElementById(id).showModal();
-    if (id === "palette") find();
-  }
+  const open = (id) => { document.getElementById(id).showModal(); if (id === "palette") find(); };
   function onKey(event) {
-    const { key } = event;
-    if ((event.ctrlKey || event.metaKey) && key === "k") {
+    const { key } = event, command = event.ctrlKey || event.metaKey;
+    if (command && key === "k") {
       event.preventDefault();
       if (!palette.open) open("palette");
     } else if (palette.open && /^Arrow(Up|Down)$/.test(key)) {
       const stops = [palette.querySelector("[name=q]"), ...palette.querySelectorAll("a")];
       stops.at((stops.indexOf(document.activeElement) + (key === "ArrowDown" ? 1 : -1)) % stops.length).focus();
       event.preventDefault();
-    } else if (single.checked && !event.ctrlKey && !event.metaKey && !event.altKey && !event.target.closest("input, select, textarea, dialog")) {
-      const target = key.length === 1 && document.querySelector(`[aria-keyshortcuts="${CSS.escape(key)}"]`);
+    } else if (single.checked && !command && !event.altKey && !event.target.closest("input, select, textarea, dialog")) {
+      const target = document.querySelector(`[aria-keyshortcuts="${CSS.escape(key)}"]`);
       if (key === "?") open("keys");
-      else if (target) {
-        event.preventDefault();
-        target.matches("input") ? target.focus() : target.click();
-      }
+      else target?.matches("input") ? target.focus() : target && target.click();
+      if (target) event.preventDefault();
     }
   }
   if (palette) {
