@@ -4,7 +4,7 @@ import ipaddress
 import shlex
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any, Final
 
 NONE: Final = "–"
@@ -68,6 +68,12 @@ def duration(seconds: float | None) -> str:
     return f"{hours // 24} d {hours % 24} h" if hours % 24 else f"{hours // 24} d"
 
 
+def elapsed(start: str, end: str | None) -> str:
+    """Format the time from one RFC 3339 time to another, or until now."""
+    last = datetime.fromisoformat(end) if end else datetime.now(UTC)
+    return duration(max(0.0, (last - datetime.fromisoformat(start)).total_seconds()))
+
+
 def size(value: float | None) -> str:
     if value is None:
         return NONE
@@ -97,6 +103,7 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
     "valid_yield": valid_yield,
     "place": lambda kind: _PLACES.get(kind, ""),
     "duration": duration,
+    "elapsed": elapsed,
     "worker_time": worker_time,
     "bytes": size,
     "stamp": stamp,

@@ -85,7 +85,9 @@ class JobDetail(Job):
     object_digest: str
     choice: FidelityChoice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
     note: str | None = Field(None, description="why fewer grasps than requested were found; null if enough")
-    outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome, if the job found too few grasps")
+    outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
+    phases: dict[str, float] = Field({}, description="time of each phase of synthesis [s]: planner, validation, ...")
+    seconds_by_device: dict[str, float] = Field({}, description="time of finished tasks by device, without reused [s]")
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
     recheck_held: int = Field(0, description="rechecked grasps that held")
     second_tested: int = Field(0, description="valid grasps that the second engine validated")

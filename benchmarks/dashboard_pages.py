@@ -65,7 +65,8 @@ def pages(services: Services) -> list[str]:
     """Return addresses of pages of every kind that the index can show."""
     jobs = [job.id for job in services.index.jobs.page(limit=3).items]
     pairs = services.index.overview.matrix()[:1]
-    found = ["/", "/?state=failed", "/datasets", *(f"/jobs/{job}" for job in jobs), "/grasps", "/grasps?view=table"]
+    found = ["/", "/jobs", "/jobs?state=failed&sort=duration", "/jobs?q=allegro+mug", "/jobs?q=none", "/search?q=mug"]
+    found += ["/objects", "/hands", "/datasets", *(f"/jobs/{job}" for job in jobs), "/grasps", "/grasps?view=table"]
     found += [f"/grasps?hand={pair.hand}&object={pair.object}&sort=penetration_depth_mm&order=asc" for pair in pairs]
     found += ["/grasps?valid=true&min_epsilon=0.3&max_penetration_depth_mm=0.5", "/workers", "/chart", "/submit"]
     return found

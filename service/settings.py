@@ -114,6 +114,9 @@ class Settings(BaseSettings):
     integrity_scan_mb_per_s: float = Field(
         1.0, ge=0, description="rate at which the controller's integrity scan reads the store [MiB/s]; 0: off"
     )
+    cpu_price_per_h: float = Field(0.0, ge=0, description="price of an hour of a CPU worker; 0: no prices on pages")
+    gpu_price_per_h: float = Field(0.0, ge=0, description="price of an hour of a GPU worker; 0: no prices on pages")
+    price_unit: str = Field("USD", max_length=8, description="currency of the prices")
     stop_grace_s: float = Field(10.0, gt=0, description="time for a process to stop before it is killed [s]")
     kernels: Path | None = Field(
         None, description="folder of `graspd admin kernels`: compiled kernels, copied to Warp's cache if missing there"

@@ -34,6 +34,7 @@ class MemoryQueue(RqQueue):
     _lease: tuple[str, float] = ("", 0.0)
     _sums: dict[str, float] = field(default_factory=dict)
     _taken: Counter[str] = field(default_factory=Counter)
+    _logs: dict[str, str] = field(default_factory=dict)
     _read: int = 0
     _acknowledged: set[str] = field(default_factory=set)
     _numbers: Iterator[int] = field(default_factory=itertools.count)
@@ -94,6 +95,12 @@ class MemoryQueue(RqQueue):
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         self._acknowledged |= set(event_ids)
+
+    def put_task_log(self, attempt: str, text: str) -> None:
+        self._logs[attempt] = text
+
+    def task_log(self, attempt: str) -> str:
+        return self._logs.get(attempt, "")
 
     def restart_consumer(self) -> None:
         left = (i for i in range(len(self._stream)) if str(i + 1) not in self._acknowledged)

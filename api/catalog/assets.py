@@ -3,7 +3,7 @@
 import io
 import json
 import logging
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Collection, Mapping, MutableMapping
 from dataclasses import replace
 from typing import Final
 
@@ -48,6 +48,10 @@ class Assets:
 
     def get(self, kind: AssetKind, name: str) -> AssetView:
         return self._services.index.assets.get(kind, name, scope=project_scope())
+
+    def datasets_of(self, digests: Collection[str]) -> dict[str, list[str]]:
+        """Return the names of the datasets that use each hand or object."""
+        return self._services.index.datasets.users_of(digests, scope=project_scope())
 
     def files(self, asset: AssetView) -> Mapping[str, bytes]:
         return library.load_asset_files(self._services.store, asset.kind, asset.digest)

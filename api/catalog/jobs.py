@@ -5,19 +5,29 @@ import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import Final, Literal
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import partial
+from typing import Any, Final, Literal
 
-from graspd.api.access.auth import caller, caller_id, project_scope, require_ownership
+from pydantic import ValidationError
+
+from graspd.api.access.auth import ForeignResource, caller, caller_id, project_scope, require_ownership
 from graspd.api.access.quotas import Idempotency, Quotas
 from graspd.api.catalog.grasps import MEAN_METRICS, Grasps
 from graspd.api.models import Job, JobDetail, MeanMetrics, Shard, StageStatus, stage_state
 from graspd.service.index.views import JobView, Page, ShardView, StageProgress, TaskView
-from graspd.service.model.domain import JobRequest
+from graspd.service.model import errors
+from graspd.service.model.domain import JobOptions, JobRequest
+from graspd.service.model.records import AttemptRecord
 from graspd.service.model.states import Stage, State
 from graspd.service.pipeline import deletion, job_actions
 from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets.cost import estimate
+from graspd.service.pipeline.datasets.spec import Estimate, Matrix
+from graspd.service.queue.port import rq_id
 from graspd.service.store.integrity import CheckedObjects
+from graspd.service.store.manifests import load_manifest
+from graspd.service.store.records import task_attempts
 from graspd.service.telemetry import bind_subjects
 
 log = logging.getLogger(__name__)
@@ -26,10 +36,7 @@ _PAGE: Final = 200
 _LOOKED_AT: Final = 20
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _SHARED: Final = Job.model_fields.keys() & JobView.model_fields.keys() - {"reason", "stages"}
-_DETAILS: Final = (
-    *("request", "choice", "note", "outcomes", "rechecked", "recheck_held", "second_tested", "second_held"),
-    *("hand_digest", "object_digest"),
-)
+_DETAILS: Final = JobDetail.model_fields.keys() & JobView.model_fields.keys() - Job.model_fields.keys() | {"note"}
 
 
 class Shards:
@@ -138,20 +145,60 @@ class Jobs:
         prefix: str = "",
         limit: int = 50,
         cursor: str | None = None,
+        **order: Any,
     ) -> Page[Job]:
-        page = self._services.index.jobs.page(
-            state=state, hand=hand, object=object, prefix=prefix, limit=limit, cursor=cursor, scope=project_scope()
-        )
+        """Return a page of jobs; `order` has `words`, `sort` and `descending` of the index."""
+        wanted = {"state": state, "hand": hand, "object": object, "prefix": prefix, **order}
+        page = self._services.index.jobs.page(**wanted, limit=limit, cursor=cursor, scope=project_scope())
         return Page[Job](items=[self._job_model(job, ()) for job in page.items], next=page.next)
 
     def get(self, job_id: str) -> JobDetail:
-        return self._job_detail(self._services.index.jobs.get(job_id, scope=project_scope()))
+        return self._job_detail(self._services.index.jobs.get(job_id, details=True, scope=project_scope()))
 
     def get_progress(self, job_id: str) -> Job:
         """Return a job with only the progress of its stages, for event streams."""
         return self._job_model(
             self._services.index.jobs.get(job_id, scope=project_scope()), self._reported_tasks(job_id)
         )
+
+    def change(self, action: str, job_ids: Iterable[str]) -> tuple[int, list[str]]:
+        """Cancel, retry or delete jobs; return the number of changed ones, and why others were not."""
+        acts: dict[str, Callable[[str], object]]
+        acts = {"cancel": self.cancel, "retry": self.retry, "delete": self.delete}
+        changed, problems = 0, []
+        for job_id in job_ids:
+            try:
+                acts[action](job_id)
+                changed += 1
+            except (errors.ConflictError, errors.NotFoundError, ForeignResource, errors.LimitError) as error:
+                problems.append(str(error))
+        return changed, problems
+
+    def tasks(self, job_id: str, *, limit: int = 50) -> list[TaskView]:
+        """Return the first tasks of a job: running ones, then failed ones, then others by batch."""
+        tasks = partial(self._services.index.jobs.tasks, job=job_id, limit=limit)
+        found = [task for state in (State.RUNNING, State.FAILED, None) for task in tasks(state=state).items]
+        return list({task.id: task for task in found}.values())[:limit]
+
+    def task(self, job_id: str, task_id: str) -> tuple[TaskView, dict[str, Any], list[AttemptRecord]]:
+        """Return a task, the `info` of its manifest (else only its log so far), and its failed attempts."""
+        task, info = self._services.index.jobs.task(task_id, scope=project_scope()), dict[str, Any]()
+        if task.job_id != job_id:
+            raise errors.NotFoundError(f"job {job_id} has no task {task_id!r}")
+        with contextlib.suppress(errors.UnavailableError, errors.NotFoundError, errors.DamagedError):
+            info = {"log": self._services.queue.task_log(rq_id(task.id, task.attempt))}
+            if task.state is State.SUCCEEDED:
+                info |= load_manifest(self._services.store, task.stage, task.shard_id).info
+        return task, info, task_attempts(self._services.store, task.id)[::-1]
+
+    def estimate(self, job: JobDetail) -> Estimate | None:
+        """Estimate a job's cost from the last tasks that were finished before its submission; None if unknown."""
+        costs = partial(self._services.index.costs.batch_costs, limit=64, before=job.created, scope=project_scope())
+        options = {name: getattr(job.request, name) for name in JobOptions.model_fields}
+        with contextlib.suppress(ValidationError, errors.GraspdError):
+            matrix = Matrix(hands=(job.hand,), objects=(job.object,), **options)
+            return estimate(self._services.index, matrix, costs=costs, scope=project_scope())
+        return None
 
     def _get_owned(self, job_id: str) -> JobView:
         job = self._services.index.jobs.get(job_id, scope=project_scope())

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable
 from datetime import UTC, date, datetime, timedelta
 from typing import Final
+from urllib.parse import quote
 
 from pydantic import Field
 
@@ -76,6 +77,12 @@ class Overview:
             return self._services.index.jobs.task(worker.task_id, scope=project_scope())
         except errors.NotFoundError:
             return None
+
+    def search(self, text: str, *, limit: int) -> list[tuple[str, str, str]]:
+        """Return kind, name and page of datasets, assets and tags with a text in their names."""
+        names = self._services.index.overview.names(text, limit=limit, scope=project_scope())
+        pages = {"tag": "/grasps?tag=", "network": "/hands?network="}
+        return [(kind, name, pages.get(kind, f"/{kind}s/") + quote(name)) for kind, name in names]
 
     def stats(self) -> Stats:
         return self._services.index.overview.stats(scope=project_scope())

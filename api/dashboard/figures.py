@@ -1,8 +1,8 @@
 """Figures of the pages: charts as SVG without scripts, the hand x object matrix, and maps of failure."""
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Final
 from urllib.parse import urlencode
 
@@ -20,15 +20,6 @@ HEIGHT: Final = 160.0
 
 
 @dataclass(frozen=True)
-class Plot:
-    """Plot of bars: SVG points for display without scripts, and numbers for the script."""
-
-    label: str
-    points: str
-    data: str
-
-
-@dataclass(frozen=True)
 class Bar:
     x: float
     y: float
@@ -40,18 +31,11 @@ class Bar:
     href: str
 
 
-def minute_plot(values: Sequence[int], start: float) -> Plot:
-    """Draw bars of the grasps made in each minute from `start` [s since 1970]."""
-    top = max([*values, 1])
-    width = WIDTH / max(len(values), 1)
-    points = " ".join(
-        f"{i * width:.1f},{HEIGHT:.0f} {i * width:.1f},{HEIGHT * (1 - v / top):.1f} "
-        f"{(i + 0.85) * width:.1f},{HEIGHT * (1 - v / top):.1f} {(i + 0.85) * width:.1f},{HEIGHT:.0f}"
-        for i, v in enumerate(values)
-    )
-    times = [start + i * 60 for i in range(len(values))]
-    data = {"xs": times, "ys": list(values), "x": "Time", "y": "Valid grasps", "unit": "/min"}
-    return Plot(f"Valid grasps per minute in the last hour; maximum {max(values, default=0)}", points, json.dumps(data))
+def minute_bars(values: Sequence[int], start: float) -> list[tuple[float, float, str]]:
+    """Return x, height and label of a bar for each minute from `start` [s since 1970]."""
+    top, width = max([*values, 1]), WIDTH / max(len(values), 1)
+    times = [datetime.fromtimestamp(start + 60 * i, UTC) for i in range(len(values))]
+    return [(i * width, HEIGHT * v / top, f"{times[i]:%H:%M} UTC: {v:,}") for i, v in enumerate(values)]
 
 
 def histogram_bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:

@@ -1,4 +1,4 @@
-"""Page of a job: stages, metrics, best grasps, attempts, files; pictures as PNG or thumbnail."""
+"""Pages of a job and of a task; pictures as PNG or thumbnail."""
 
 import io
 from collections.abc import Callable
@@ -17,6 +17,8 @@ from graspd.api.dashboard.rendering import render
 from graspd.api.models import GraspQuery, JobDetail
 from graspd.api.routes.dependencies import READ, GraspsOf, JobsOf, ShardsOf, TagsOf
 from graspd.service.model.errors import NotFoundError
+from graspd.service.model.planning import OUTCOMES, phase_seconds
+from graspd.service.settings import Settings
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import open_shard
 from graspd.service.store.store import Store
@@ -39,9 +41,16 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
     return render(
         request,
         "job.html",
+        page="/jobs",
         events="" if job.state.is_final else f"/v1/jobs/{job.id}/events",
         refresh_s=0 if job.state.is_final else 3,
         job=job,
+        tasks=jobs.tasks(job_id),
+        rejected={OUTCOMES.get(name, name): number for name, number in job.outcomes.items()},
+        reused=sum(stage.reused for stage in job.stages),
+        task_count=sum(stage.tasks for stage in job.stages),
+        expected=jobs.estimate(job),
+        cost=_cost_of(request.app.state.settings, job),
         histograms=[
             (*shown[data.metric], data, figures.histogram_bars(data, "/grasps", where))
             for data in grasps.statistics(job)[0]
@@ -59,6 +68,33 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         sort="epsilon",
         shards=job.shards,
     )
+
+
+@router.get("/jobs/{job_id}/tasks/{task_id}", dependencies=READ)
+def task_page(request: Request, job_id: str, task_id: str, jobs: JobsOf) -> HTMLResponse:
+    """Show a task with the log of its worker, its phases and its failed attempts."""
+    job, (task, info, attempts) = jobs.get_progress(job_id), jobs.task(job_id, task_id)
+    ended = task.state.is_final
+    return render(
+        request,
+        "task.html",
+        page="/jobs",
+        events="" if ended else f"/v1/jobs/{job.id}/events",
+        refresh_s=0 if ended else 3,
+        job=job,
+        task=task,
+        log=info.get("log", ""),
+        phases=phase_seconds(info),
+        attempts=attempts,
+    )
+
+
+def _cost_of(settings: Settings, job: JobDetail) -> dict[str, float]:
+    """Return the times of a job's finished tasks on CPU and GPU workers [s], and their price."""
+    gpu = sum(seconds for device, seconds in job.seconds_by_device.items() if device.startswith("cuda"))
+    cpu = sum(job.seconds_by_device.values()) - gpu
+    price = (cpu * settings.cpu_price_per_h + gpu * settings.gpu_price_per_h) / 3600
+    return {"cpu": cpu, "gpu": gpu, "all": cpu + gpu, "price": price}
 
 
 Channel = Literal["rgb", "depth", "segmentation", "rgb_hand"]

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterable
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Final
 
-from fastapi import APIRouter, FastAPI, Form, Query, Request
+from fastapi import APIRouter, FastAPI, Form, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
@@ -15,7 +15,17 @@ from graspd.api.access.keys import SESSION_S, KeyFile, Scope
 from graspd.api.catalog import events
 from graspd.api.catalog.events import Webhooks
 from graspd.api.catalog.overview import MINUTES, Overview
-from graspd.api.dashboard import dataset_pages, figures, forms, grasp_pages, hand_pages, job_pages, tradeoff
+from graspd.api.dashboard import (
+    asset_pages,
+    dataset_pages,
+    figures,
+    forms,
+    grasp_pages,
+    job_list,
+    job_pages,
+    search,
+    tradeoff,
+)
 from graspd.api.dashboard.forms import FormEstimates
 from graspd.api.dashboard.job_pages import ShardPictures
 from graspd.api.dashboard.rendering import SEEN, environment, redirect, render, seen_end
@@ -25,12 +35,13 @@ from graspd.api.routes.system import Since, Until
 from graspd.service.index.views import WorkerView
 from graspd.service.model.domain import METHODS
 from graspd.service.model.errors import ERRORS, InputError, UnavailableError
-from graspd.service.model.states import State
 from graspd.service.model.webhooks import MAX_URL, End
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.records import What
 
-PAGE_SIZE: Final = 25
+_JOBS: Final = 8
+#: Most ends of jobs and datasets on the page of notifications.
+_ENDS: Final = 25
 _LOST_SHOWN: Final = timedelta(minutes=10)
 _DATASETS: Final = 6
 #: Polling interval [s]: a study takes minutes, and no event announces its publication.
@@ -41,14 +52,8 @@ router = APIRouter(include_in_schema=False)
 
 @router.get("/", dependencies=dependencies.READ)
 def home(
-    request: Request,
-    overview: dependencies.OverviewOf,
-    jobs: dependencies.JobsOf,
-    datasets: dependencies.DatasetsOf,
-    state: str = "",
-    cursor: Annotated[str | None, Query(max_length=512)] = None,
+    request: Request, overview: dependencies.OverviewOf, jobs: dependencies.JobsOf, datasets: dependencies.DatasetsOf
 ) -> HTMLResponse:
-    chosen = State(state) if state in set(State) else None
     minutes = overview.valid_per_minute()
     start = time.time() // 60 * 60 - 60 * (MINUTES - 1)
     return render(
@@ -57,11 +62,10 @@ def home(
         page="/",
         events="/events",
         refresh_s=5,
-        chosen=chosen or "",
         stats=overview.stats(),
         minutes=minutes,
-        pace=figures.minute_plot(minutes, start),
-        jobs=jobs.page(state=chosen, limit=PAGE_SIZE, cursor=cursor),
+        pace=figures.minute_bars(minutes, start),
+        jobs=jobs.page(limit=_JOBS),
         stages=stage_depths(overview),
         workers=[worker for worker in overview.workers() if is_recent(worker)],
         failures=overview.failures(),
@@ -168,7 +172,7 @@ def delete_webhook(webhook_id: str, webhooks: dependencies.WebhooksOf) -> Redire
 
 def _render_notifications(request: Request, webhooks: Webhooks, *, status: int = 200, **shown: str) -> HTMLResponse:
     """Show the visitor's ended jobs and datasets, which counts as seen, and the webhooks it may change."""
-    ends = webhooks.own_ends(0, limit=PAGE_SIZE)
+    ends = webhooks.own_ends(0, limit=_ENDS)
     hooks = webhooks.all() if is_allowed(request, Scope.SUBMIT) else []
     page = render(
         request,
@@ -288,9 +292,11 @@ def _redirect_to_deletions(id: str) -> RedirectResponse:
 
 routers: Final = (
     router,
+    search.router,
+    job_list.router,
     job_pages.router,
     grasp_pages.router,
-    hand_pages.router,
+    asset_pages.router,
     dataset_pages.router,
     dataset_pages.comparison_router,
     forms.router,

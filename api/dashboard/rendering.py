@@ -19,9 +19,11 @@ _HERE: Final = Path(__file__).parent
 STATIC: Final = _HERE / "static"
 NAVIGATION: Final = (
     ("/", "Home"),
+    ("/jobs", "Jobs"),
     ("/datasets", "Datasets"),
     ("/grasps", "Grasps"),
     ("/hands", "Hands"),
+    ("/objects", "Objects"),
     ("/workers", "Workers"),
     ("/usage", "Usage"),
     ("/engine", "Engine"),
@@ -33,6 +35,8 @@ _NO_FILTERS: Final = ("view", "cursor", "did", "done", "named")
 #: Cookie with the number of the last end of a job or dataset that the visitor has seen.
 SEEN: Final = "graspd_seen"
 MOST_UNREAD: Final = 100
+#: Keyboard shortcuts of pages.
+KEYS: Final = {f"/{page}": page[0] for page in ("jobs", "datasets", "grasps", "hands", "objects", "workers")}
 
 
 def environment() -> Environment:
@@ -64,12 +68,14 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
         "navigation": NAVIGATION if may_read else (),
         "unread": len(ends) if has_bell else None,
         "toast": unquote(toast := request.cookies.get(_TOAST, "")),
+        "keys": KEYS,
         "version": PACKAGE_VERSION,
         "signed_in": not request.app.state.keys.is_open,
         # Actions that the key does not permit have no button; routes also refuse them.
         "may_submit": is_allowed(request, Scope.SUBMIT),
         "may_change": may_change,
         "grace_s": request.app.state.settings.shard_grace_s,
+        "price_unit": request.app.state.settings.price_unit,
     }
     text = request.app.state.templates.get_template(template).render(context)
     text = add_prefix(text, request.app.state.settings.api_root_path or "")

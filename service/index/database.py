@@ -22,7 +22,6 @@ from typing import Any, Final, TypeVar
 from pydantic_core import from_json
 from sqlalchemy import (
     URL,
-    Column,
     ColumnElement,
     Connection,
     Engine,
@@ -467,7 +466,7 @@ _MOST: Final = 2**63
 def page_rows(
     connection: Connection,
     query: Select[Any],
-    *key: Column[Any],
+    *key: ColumnElement[Any],
     limit: int,
     cursor: str | None,
     descending: bool = True,
@@ -479,7 +478,7 @@ def page_rows(
         query = query.where(tuple_(*key) < start if descending else tuple_(*key) > start)
     query = query.order_by(*(part.desc() if descending else part for part in key)).limit(size + 1)
     rows = connection.execute(query).mappings().all()
-    return rows[:size], encode_cursor(*(rows[size - 1][part.key] for part in key)) if len(rows) > size else None
+    return rows[:size], encode_cursor(*(rows[size - 1][str(part.key)] for part in key)) if len(rows) > size else None
 
 
 def encode_cursor(*key: Any) -> str:

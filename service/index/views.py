@@ -74,6 +74,8 @@ class JobView(Validated):
     second_tested: int = Field(0, description="valid grasps that the second engine validated")
     second_held: int = Field(0, description="those that it held")
     outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
+    phases: dict[str, float] = Field({}, description="time of each phase of synthesis [s]: planner, validation, ...")
+    seconds_by_device: dict[str, float] = Field({}, description="time of finished tasks by device, without reused [s]")
 
     @computed_field(description="why fewer grasps than requested were found; null: not applicable")  # type: ignore[prop-decorator]
     @property
@@ -317,6 +319,8 @@ class DatasetView(Validated):
     finished: str | None
     cancelled: bool = Field(description="whether its user cancelled it; `retry` resumes it")
     outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
+    phases: dict[str, float] = Field({}, description="time of each phase of synthesis [s]: planner, validation, ...")
+    seconds_by_device: dict[str, float] = Field({}, description="time of finished tasks by device, without reused [s]")
 
     @computed_field(description="why fewer grasps than requested were found; null: not applicable")  # type: ignore[prop-decorator]
     @property

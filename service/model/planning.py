@@ -260,6 +260,13 @@ def sum_outcomes(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     return {name: int(count) for name, count in found.items() if count}
 
 
+def phase_seconds(*infos: Mapping[str, Any]) -> dict[str, float]:
+    """Return the time of each phase [s] in the `info` of manifests: planner, validation, quality."""
+    times = [(name[:-8], value) for info in infos for name, value in info.items() if name.endswith("_seconds")]
+    times = [(name, value) for name, value in times if isinstance(value, int | float)]
+    return {name: sum(value for one, value in times if one == name) for name in dict(times)}
+
+
 def format_outcomes(outcomes: Mapping[str, int]) -> str:
     order = sorted(outcomes.items(), key=lambda pair: -pair[1])
     return ", ".join(f"{count:,} {OUTCOMES.get(name, name.replace('_', ' '))}" for name, count in order if count)

@@ -114,6 +114,7 @@ class AttemptRecord(Record):
     started: str | None = None
     ended: str
     last: bool
+    log: str = Field("", exclude_if=lambda value: not value, description="last lines of the worker's log")
 
     @classmethod
     def from_message(cls, message: TaskMessage | IngestMessage, **facts: Any) -> Self:

@@ -14,7 +14,7 @@ from graspd.service.model.records import AttemptRecord
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.indexer import Indexer
-from graspd.service.queue.port import Lease
+from graspd.service.queue.port import Lease, rq_id
 from graspd.service.store.integrity import put_document
 from graspd.service.store.manifests import load_manifest
 from graspd.service.store.packs import convert_packs
@@ -142,6 +142,7 @@ class LeaseReaper:
             reason=f"worker {worker} was lost: no heartbeat for {self._services.settings.lease_s:g} s",
             worker=worker,
             last=message.attempt >= message.max_attempt,
+            log=self._services.queue.task_log(rq_id(message.task_id, message.attempt)),
         )
         key = names.attempt_key(message.task_id, message.attempt)
         if not put_record(self._services.store, key, attempt):

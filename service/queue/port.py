@@ -40,6 +40,8 @@ class EventKind(StrEnum):
 
 
 _LONGEST: Final = 2000
+#: Longest log of a task [characters].
+MOST_LOG: Final = 64_000
 
 
 class Event(Model):
@@ -59,6 +61,11 @@ class Event(Model):
 
     # A newer worker may send more fields than an older controller knows.
     model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+def rq_id(task_id: str, attempt: int) -> str:
+    """Return the RQ job id of an attempt; a slow worker thus cannot affect a later attempt."""
+    return f"{task_id}-{attempt}"
 
 
 @dataclass(frozen=True)

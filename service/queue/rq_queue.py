@@ -28,7 +28,7 @@ from graspd.service.model.renamed import message_for_revision
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue import entries
 from graspd.service.queue.connection import connect, redis_url
-from graspd.service.queue.port import Event, Lease, Message, Place, QueueStatus
+from graspd.service.queue.port import MOST_LOG, Event, Lease, Message, Place, QueueStatus, rq_id
 from graspd.service.settings import Settings
 
 EVENTS: Final = "graspd:events"
@@ -43,7 +43,10 @@ LEAD: Final = "graspd:lead:keeper"
 METRICS: Final = "graspd:metrics"
 _SERVICE: Final = "graspd:service"
 _CANCEL_TTL_S: Final = 24 * 3600
+#: Lifetime of the log of a task in Redis [s]; ended attempts have it in the store.
+_LOG_TTL_S: Final = 3600
 _WORKER: Final = b"graspd:worker:"
+_LOG: Final = "graspd:log:"
 
 
 class RqQueue:
@@ -189,6 +192,16 @@ class RqQueue:
                 if known := self._readable_events(pending):
                     return known
             return self._readable_events(self._read_group(">", limit, wait_s))
+
+    def put_task_log(self, attempt: str, text: str) -> None:
+        """Replace the log of an attempt, which has the id `rq_id(...)`."""
+        with _convert_errors():
+            self.connection.set(_LOG + attempt, text, ex=_LOG_TTL_S)
+
+    def task_log(self, attempt: str) -> str:
+        """Return the log of an attempt that runs or ended recently; "" without one."""
+        with _convert_errors():
+            return entries.decode_text(self.connection.get(_LOG + attempt))[:MOST_LOG]
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         if event_ids:
@@ -349,11 +362,6 @@ def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
 
 def put_event(pipe: Any, event: Event) -> None:
     pipe.xadd(EVENTS, {"e": event.model_dump_json(exclude_defaults=True)}, maxlen=EVENTS_KEPT, approximate=True)
-
-
-def rq_id(task_id: str, attempt: int) -> str:
-    """Return the RQ job id of an attempt; a slow worker thus cannot affect a later attempt."""
-    return f"{task_id}-{attempt}"
 
 
 def cancel_key(task_id: str) -> str:

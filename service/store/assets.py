@@ -19,6 +19,7 @@ from graspd.service.store.descriptions import MAX_BYTES, parse_description
 
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 #: Creation date of built-in assets: the date of the release, so that repeated publication writes equal records.
+BUILTIN_LICENCE: Final = "Apache-2.0"
 _BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
 MAX_FILES: Final = 2000
 #: Prefix of zlib's message about lack of memory; other messages mean damage.
@@ -218,7 +219,7 @@ def create_asset(
         size_bytes=sum(files.size(name) if isinstance(files, ZipFiles) else len(files[name]) for name in files),
         created=created,
         builtin=builtin,
-        facts=description.facts,
+        facts={"licence": description.licence, **description.facts} if description.licence else description.facts,
     )
 
 

@@ -22,7 +22,7 @@ from graspd.service.model.states import AssetKind
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.readers import ShardFile, Shards, open_shards
 from graspd.service.store import validity
-from graspd.service.store.assets import builtin_asset, builtin_files, builtin_names
+from graspd.service.store.assets import BUILTIN_LICENCE, builtin_asset, builtin_files, builtin_names
 from graspd.service.store.library import load_asset, load_asset_files, load_check
 from graspd.service.store.manifests import ShardManifest, load_manifest
 from graspd.service.store.records import load_dataset, newest_snapshot, parse_record, task_attempts
@@ -30,7 +30,6 @@ from graspd.service.store.shards import json_attribute, open_shard, read_column
 from graspd.service.store.store import Store
 
 Pair = tuple[str, str]
-_BUILTIN_LICENCE: Final = "Apache-2.0"
 
 
 @dataclass(frozen=True)
@@ -143,7 +142,7 @@ def _asset_facts(name: str, digest: str, files: Mapping[str, bytes], facts: Any,
     stated = json.loads(files["asset.json"])
     licence, source = str(stated.get("licence", "")), str(stated.get("source", ""))
     if builtin:
-        licence, source = licence or _BUILTIN_LICENCE, source or f"built into graspd {PACKAGE_VERSION}"
+        licence, source = licence or BUILTIN_LICENCE, source or f"built into graspd {PACKAGE_VERSION}"
     return AssetFacts(name, digest, licence, source, str(stated.get("description", "")), dict(facts))
 
 

@@ -2,7 +2,9 @@
 
 import io
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +48,7 @@ def add_job(services: Services, **fields: object) -> JobRecord:
     return record
 
 
-def finish(services: Services, record: JobRecord, task: PlannedTask) -> ShardManifest:
+def finish(services: Services, record: JobRecord, task: PlannedTask, **info: object) -> ShardManifest:
     """A task's shard, with columns of the right shapes and random values, as a worker publishes it."""
     random = np.random.default_rng(task.batch)
     arrays = _ARRAYS[task.stage](random, task.count, record.request)
@@ -57,19 +59,23 @@ def finish(services: Services, record: JobRecord, task: PlannedTask) -> ShardMan
         attributes["base_shard" if reads_base else "scene_shard"] = task.inputs[0]
     if task.stage is Stage.SYNTHESIZE:
         attributes["joint_names"] = [f"joint_{i}" for i in range(JOINTS)]
-    return publish(services, record, task, arrays, attributes)
+    return publish(services, record, task, arrays, attributes, info)
 
 
 def publish(
-    services: Services, record: JobRecord, task: PlannedTask, arrays: Arrays, attributes: dict[str, Attribute]
+    services: Services,
+    record: JobRecord,
+    task: PlannedTask,
+    arrays: Arrays,
+    attributes: dict[str, Attribute],
+    info: Mapping[str, object] = MappingProxyType({}),
 ) -> ShardManifest:
     """A task's shard of these columns, in the store and in the index."""
     kind = names.SHARD_KINDS[task.stage]
     data = write_shard(kind, arrays, attributes)
     message = create_task_message(record, task, attempt=1, max_attempt=3)
-    manifest = create_manifest(
-        message, data, arrays, attributes, check_columns(kind, arrays), device="cpu", seconds=12.5, worker="worker-1"
-    )
+    made = {"device": "cpu", "seconds": 12.5, "worker": "worker-1", "info": info}
+    manifest = create_manifest(message, data, arrays, attributes, check_columns(kind, arrays), **made)
     publish_shard(services.store, manifest, data)
     services.index.write.add_manifests([manifest])
     return manifest

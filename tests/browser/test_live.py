@@ -1,6 +1,7 @@
 """The pages in a real browser: they move by themselves, fit every screen, read without scripts, are accessible."""
 
 import re
+import time
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,12 @@ from urllib.parse import urlsplit
 import pytest
 
 from graspd.service.model.planning import plan_tasks
+from graspd.service.model.states import State
 from graspd.service.pipeline import deletion, tagging
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
+from graspd.service.queue.port import rq_id
 from graspd.service.store.records import publish_record
 from tests.api.dashboard.test_tradeoff import RUNS, a_record
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
@@ -25,8 +28,15 @@ AXE = Path(__file__).parent / "vendor" / "axe.min.js"
 COLOURS = ["color-contrast", "link-in-text-block"]
 #: Pages that show all colours between them.
 IN_DARK = re.compile(
-    r"/$|/datasets/kitchen$|/jobs/|/grasps$|/grasps/|/hands/|/stability|/chart|/submit|/engine|/notifications"
+    r"/$|/datasets/kitchen$|/jobs|/objects|/search|/hands|/grasps$|/grasps/|/hands/|/stability|/chart|/submit|/problems|/engine|/notifications"
 )
+#: Pages that are looked at by axe at all widths, too.
+NARROW = re.compile(r"/$|/jobs|/objects|/hands|/search")
+WHY = {
+    "outcomes": {"slipped": 70, "penetration": 12},
+    "planner_seconds": 9.0,
+    "log": "12:00:00.000 INFO progress 0% starts",
+}
 CHART = {"created": "2026-11-21T12:00:00Z", "device": "cpu", "runs": RUNS}
 
 
@@ -36,7 +46,9 @@ def places(services: Services) -> list[str]:
     # A list of few grasps has what one of many has, and is looked at sooner.
     record = add_job(services, grasps=6, scenes=1, views=2, stereo=True)
     shard = finish_all(services, record)[0].shard_id
-    fail(services, add_job(services, seed=9), "a reason " * 30)
+    fail(services, failed := add_job(services, seed=9), "a reason " * 30)
+    few = add_job(services, grasps=6, seed=12)
+    finish(services, few, next(plan_tasks(few)), **WHY)
     waiting = add_job(services, seed=10)
     add_worker(services, "worker-1", "idle")
     wanted = DatasetRequest.model_validate({"name": "kitchen", "hands": ["allegro"], "objects": ["mug", "block"]})
@@ -48,12 +60,14 @@ def places(services: Services) -> list[str]:
     fail(services, gone, "a reason")
     deletion.delete_job(services, gone.id)
     datasets = "/ /datasets /datasets/kitchen /datasets/kitchen?state=queued /compare?one=kitchen&other=kitchen /engine"
+    finding = "/jobs /jobs?q=none /jobs?state=failed /objects /objects/mug /search?q=mug"
     grasps = "/grasps /grasps?view=table /grasps?min_epsilon=99 /grasps?tag=good+ones /hands /hands/shadow"
     others = (
         "/docs /workers /chart /stability /submit /submit?density=400 /notifications /problems /login /deleted /usage"
     )
-    of_these = [f"/jobs/{record.id}", f"/jobs/{waiting.id}", f"/grasps/{shard}/0"]
-    return [*datasets.split(), *of_these, *grasps.split(), *others.split()]
+    tasks = [f"/jobs/{job.id}/tasks/{next(plan_tasks(job)).id}" for job in (few, failed, waiting)]
+    of_these = [*(f"/jobs/{job.id}" for job in (record, few, failed, waiting)), *tasks, f"/grasps/{shard}/0"]
+    return [*datasets.split(), *of_these, *finding.split(), *grasps.split(), *others.split()]
 
 
 def test_a_job_page_follows_its_job_without_a_reload(page: Any, services: Services) -> None:
@@ -153,7 +167,7 @@ BESIDE_CARDS = """() => [...document.querySelectorAll('.card')].flatMap(card => 
     }).map(one => `${card.className}: ${one.outerHTML.slice(0, 80)}`);
 })"""
 #: Tables that a phone shows as lines: nothing of them is cut off.
-TABLES_OF_LINES = ("/", "/hands", "/problems", "/deleted", "/notifications")
+TABLES_OF_LINES = ("/", "/jobs", "/problems", "/deleted", "/notifications")
 
 
 def test_a_phone_shows_all_of_short_tables(page: Any, places: list[str]) -> None:
@@ -196,11 +210,15 @@ def test_no_page_has_a_serious_accessibility_finding(page: Any, places: list[str
         page.evaluate(AXE.read_text())
         # Colours are the same variables on all pages: some show them all.
         dark = [("dark", f"{{ runOnly: {COLOURS} }}")] if IN_DARK.match(path) else []
-        for scheme, rules in [("light", "{}"), *dark]:
+        narrow = (
+            [(width, *one) for width in (1024, 390) for one in (("light", "{}"), *dark)] if NARROW.match(path) else []
+        )
+        for width, scheme, rules in [(1440, "light", "{}"), *((1440, *one) for one in dark), *narrow]:
+            page.set_viewport_size({"width": width, "height": 900})
             page.emulate_media(color_scheme=scheme)
             result = page.evaluate(f"axe.run(document, {{ resultTypes: ['violations'], ...{rules} }})")
             found += [
-                f"{path}, {scheme}: {entry['id']}: {nodes[:3]}"
+                f"{path}, {scheme}, {width}: {entry['id']}: {nodes[:3]}"
                 for entry in result["violations"]
                 if entry["impact"] in ("serious", "critical") and (nodes := _nodes(entry))
             ]
@@ -297,6 +315,113 @@ def test_grasps_are_chosen_tagged_found_and_exported_by_keyboard(page: Any, serv
     page.fill("#where", "epsilon > 1000")
     page.keyboard.press("Enter")
     page.wait_for_selector("text=No grasp matches these filters")
+
+
+class Hand:
+    """Clicks of a user; `seconds` is their time with the answers of the pages."""
+
+    def __init__(self, page: Any) -> None:
+        self.page, self.clicks, self._start = page, 0, time.monotonic()
+
+    def click(self, where: str) -> None:
+        self.clicks += 1
+        self.page.click(where)
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self._start
+
+
+def test_fifty_queued_jobs_are_cancelled_in_four_clicks(page: Any, services: Services, record_property: Any) -> None:
+    jobs = [add_job(services, seed=seed).id for seed in range(50)]
+    finish_all(services, done := add_job(services, seed=50))
+    page.goto("/")
+    hand = Hand(page)
+    hand.click("nav >> text=Jobs")
+    hand.click("#found nav >> text=queued")
+    hand.click("[data-every]")
+    assert page.inner_text("[data-chosen]") == "50 jobs selected"
+    hand.click("#list button:has-text('Cancel')")
+    page.wait_for_selector("text=50 jobs cancelled.")
+    record_property("seconds", hand.seconds)
+    assert hand.clicks <= 4
+    assert {services.index.jobs.get(job).state for job in jobs} == {State.CANCELLED}
+    assert services.index.jobs.get(done.id).state is State.SUCCEEDED
+
+
+def test_why_a_job_found_little_is_seen_in_three_clicks(page: Any, services: Services, record_property: Any) -> None:
+    for seed in range(30):
+        add_job(services, seed=seed)
+    job = add_job(services, hand="barrett")
+    finish(services, job, next(plan_tasks(job)), **WHY)
+    add_job(services, seed=40)
+    page.goto("/")
+    hand = Hand(page)
+    hand.click("nav >> text=Jobs")
+    page.fill("#q", "barrett")
+    page.wait_for_url("**q=barrett**")
+    hand.click("#list a.main")
+    page.wait_for_selector("#follow .meter")
+    record_property("seconds", hand.seconds)
+    first = page.inner_text("#follow .meter >> nth=0").split("\n")
+    assert "slipped" in first[0] and "70" in "".join(first[:3])
+    assert page.locator("#follow .meter").first.bounding_box()["y"] < 900, "without scrolling"
+    hand.click("#tasks a.main")
+    page.wait_for_selector("text=progress 0% starts")
+    assert hand.clicks <= 3
+
+
+def test_a_view_of_the_list_is_saved_shown_and_removed(page: Any, services: Services) -> None:
+    fail(services, add_job(services), "a reason")
+    page.goto("/jobs?state=failed&q=mug")
+    page.fill("[name=view]", "my failures")
+    page.keyboard.press("Enter")
+    page.goto("/jobs")
+    page.click("#view-names >> text=my failures")
+    page.wait_for_url("**/jobs?state=failed&q=mug")
+    assert page.get_attribute("#view-names a", "aria-current") == "true"
+    page.fill("[name=view]", "my failures")
+    page.click("text=Save this view")
+    assert page.locator("#view-names a").count() == 0
+
+
+def test_a_log_grows_on_the_page_of_its_task(page: Any, services: Services) -> None:
+    job = add_job(services)
+    task = next(plan_tasks(job))
+    page.goto(f"/jobs/{job.id}/tasks/{task.id}")
+    page.wait_for_selector("text=The log appears when a worker starts the task.")
+    services.queue.put_task_log(rq_id(task.id, 1), "it rolls")
+    services.index.live.set_running({task.id: "worker-1"})
+    page.wait_for_selector("text=it rolls")
+    finish(services, job, task, log="it rolls\nit is done")
+    page.wait_for_selector("text=it is done")
+
+
+def test_the_keyboard_leads_everywhere(page: Any, services: Services) -> None:
+    job = add_job(services, hand="barrett")
+    page.goto("/")
+    page.keyboard.press("Control+k")
+    page.keyboard.type(job.id[:7])
+    page.wait_for_selector(f"#palette a[href='/jobs/{job.id}']")
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("Enter")
+    page.wait_for_url(f"**/jobs/{job.id}")
+    page.keyboard.press("o")
+    page.wait_for_url("**/objects")
+    page.keyboard.press("j")
+    page.wait_for_url("**/jobs")
+    page.keyboard.press("/")
+    page.keyboard.type("jog")
+    assert page.input_value("#q") == "jog", "keys in a field are text"
+    page.locator("h1").click()
+    page.locator("#q").blur()
+    page.keyboard.press("?")
+    page.wait_for_selector("text=Keyboard shortcuts")
+    page.uncheck("#single-keys")
+    page.keyboard.press("Escape")
+    page.keyboard.press("d")
+    page.keyboard.press("?")
+    assert page.locator("#keys").is_hidden() and "/jobs" in page.url, "they can be switched off"
 
 
 @pytest.mark.parametrize(("scheme", "dark"), [("light", False), ("dark", True)])

@@ -3,7 +3,7 @@
 Over a pipe the worker (`worker.process.main`) first sends a `Setup`, then orders of the form (name, argument).
 `service` compares store and Redis. `check` is answered by `ready`, `task` by `done` and then `idle`; `end` ends the
 process. `refused`, with an error, may replace any answer. `stop` with a reason is accepted at any time. The engine also
-sends `facts` for the list of workers (including progress) and `event`. It does not access Redis."""
+sends `facts` for the list of workers (including progress), `event`, and the task's `log`. It does not access Redis."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from graspd.service.model.errors import BusyError, InputError, TaskRefused, Unav
 from graspd.service.model.libraries import freeze_imports
 from graspd.service.model.states import Stage
 from graspd.service.pipeline.identity import check_service
+from graspd.service.queue.port import rq_id
 from graspd.service.store.store import Store, open_store
 from graspd.worker.engines.batch_sizes import batches_per_launch, pool_process_count
 from graspd.worker.engines.devices import Device
@@ -37,6 +38,7 @@ from graspd.worker.process.fitness import Check, Fitness
 from graspd.worker.process.link import Condition, Setup
 from graspd.worker.process.runner import Runner
 from graspd.worker.process.selfcheck import check_engine
+from graspd.worker.process.task_log import TaskLog
 from graspd.worker.stages import stage_table
 from graspd.worker.stages.context import StageFunction, StopReason, TaskContext
 
@@ -64,6 +66,7 @@ class Engine:
         self._orders: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._reason: StopReason | None = None
         self._context: TaskContext | None = None
+        self._log = TaskLog(lambda task, text: self._send("log", (task, text)))
 
     def serve(self) -> None:
         with self._connection:
@@ -120,13 +123,15 @@ class Engine:
         return self._fitness.wait_in_quarantine(stages, self.update, lambda: self._reason is not None)
 
     def _run_task(self, raw: dict[str, Any]) -> None:
-        context = self._surroundings.context(raw, self.update)
+        context = self._surroundings.context(raw, self.update, self._log)
         with self._changing:
             self._context = context
             if self._reason is not None:
                 context.stop(self._reason)
         try:
-            self._send("done", self._runner.run(raw, context))
+            with self._log.of_task(rq_id(str(raw.get("task_id", "")), raw.get("attempt", 1))):
+                outcome = self._runner.run(raw, context)
+            self._send("done", outcome)
         except TaskRefused as error:
             self._send("refused", error)
         finally:
@@ -208,14 +213,16 @@ class TaskResources:
         if (pool := vars(self).get("_pool")) is not None:
             pool.close()
 
-    def context(self, raw: Mapping[str, Any], update: Callable[..., None]) -> TaskContext:
+    def context(self, raw: Mapping[str, Any], update: Callable[..., None], log: TaskLog) -> TaskContext:
         def tell(done: float, total: float, message: str) -> None:
             update(done=done, total=total, message=message[:200])
+            log.note_progress(done, total, message)
 
         stage, chosen = raw.get("stage", ""), self.settings
         device = "cpu" if stage == Stage.INGEST else self._device.resolve()
         run = ExecutionContext(device, chosen.threads, prefilter=chosen.prefilter, pool=self.pool(stage))
-        return TaskContext(self.store, run, join=self._join if stage == Stage.SYNTHESIZE else 1, tell=tell)
+        join = self._join if stage == Stage.SYNTHESIZE else 1
+        return TaskContext(self.store, run, join=join, tell=tell, log=log.text)
 
 
 def resident_mb(pid: int | None = None) -> float:

@@ -13,6 +13,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any, Final
@@ -137,6 +138,9 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             raise about
         if word == "facts":
             self._heartbeat.update(**about)
+        elif word == "log":
+            with suppress(QueueUnavailable):
+                self._queue.put_task_log(*about)
         else:
             self._publish(about)
 

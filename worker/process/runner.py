@@ -6,12 +6,14 @@ import os
 import time
 import traceback
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 from pydantic import ValidationError
 
 from graspd.service.model import errors, messages, names
 from graspd.service.model.clock import timestamp
+from graspd.service.model.planning import format_outcomes, phase_seconds
 from graspd.service.model.records import AttemptRecord
 from graspd.service.model.renamed import convert_names
 from graspd.service.model.states import Stage
@@ -92,8 +94,12 @@ class Runner:
         self._check_device(context.device)
         seconds = time.perf_counter() - clock
         if made is not None and isinstance(message, messages.TaskMessage):
+            phases = [f"{name} {time_s:.2f} s" for name, time_s in phase_seconds(made.info).items()]
+            rejected = format_outcomes(made.info.get("outcomes", {}))
+            log.info("computed in %.2f s; %s", seconds, "; ".join([*phases, f"rejected: {rejected or 'none'}"]))
             context.check()
             device, worker = context.device, self._worker
+            made = replace(made, info={**made.info, "log": context.log()})
             manifest, data = build_shard(message, made, device=device, seconds=seconds, worker=worker, lost=lost)
             if lost is not None and manifest.sha256 != lost.sha256:
                 raise errors.DamagedShard(
@@ -152,6 +158,7 @@ class Runner:
             worker=self._worker,
             started=started,
             last=last,
+            log=context.log(),
         )
         try:
             if isinstance(message, messages.TaskMessage) and _has_manifest(message, context):

@@ -48,11 +48,12 @@ class TaskContext:
         *,
         join: int = 1,
         tell: Callable[[float, float, str], None] | None = None,
+        log: Callable[[], str] = str,
     ) -> None:
-        """`join`: number of batches planned in one launch; `tell`: receives done, total and a message."""
+        """`join`: batches per launch; `tell`: receives done, total and a message; `log`: log so far."""
         self.store, self.device, self.join = store, run.device, join
         self.run = replace(run, progress=self.progress, cancelled=self.cancelled)  # execution context for the engine
-        self._tell, self._tell_again = tell, 0.0
+        self._tell, self._tell_again, self.log = tell, 0.0, log
         self._stop = threading.Event()
         self.stop_reason: StopReason | None = None
 

@@ -77,6 +77,40 @@
     for (const button of root.querySelectorAll("button[data-copy]")) button.hidden = false;
   }
 
+  // Command palette and keyboard shortcuts; a link has its key in `aria-keyshortcuts`.
+  const palette = document.getElementById("palette"), single = document.getElementById("single-keys");
+  let asked = 0;
+  async function find() {
+    const form = palette.querySelector("form"), number = ++asked;
+    const answer = await fetch(`${form.action}?q=${encodeURIComponent(form.q.value)}`);
+    const found = answer.ok && new DOMParser().parseFromString(await answer.text(), "text/html").getElementById("results");
+    if (found && number === asked) palette.querySelector("ul").replaceChildren(...found.children);
+  }
+  const open = (id) => { document.getElementById(id).showModal(); if (id === "palette") find(); };
+  function onKey(event) {
+    const { key } = event, command = event.ctrlKey || event.metaKey;
+    if (command && key === "k") {
+      event.preventDefault();
+      if (!palette.open) open("palette");
+    } else if (palette.open && /^Arrow(Up|Down)$/.test(key)) {
+      const stops = [palette.querySelector("[name=q]"), ...palette.querySelectorAll("a")];
+      stops.at((stops.indexOf(document.activeElement) + (key === "ArrowDown" ? 1 : -1)) % stops.length).focus();
+      event.preventDefault();
+    } else if (single.checked && !command && !event.altKey && !event.target.closest("input, select, textarea, dialog")) {
+      const target = document.querySelector(`[aria-keyshortcuts="${CSS.escape(key)}"]`);
+      if (key === "?") open("keys");
+      else target?.matches("input") ? target.focus() : target && target.click();
+      if (target) event.preventDefault();
+    }
+  }
+  if (palette) {
+    single.checked = localStorage.getItem("single-keys") !== "off";
+    single.addEventListener("change", () => localStorage.setItem("single-keys", single.checked ? "on" : "off"));
+    palette.addEventListener("input", () => find().catch(() => {}));
+    document.addEventListener("keydown", onKey);
+    document.querySelector("[data-opens]").addEventListener("click", (event) => { event.preventDefault(); open("palette"); });
+  }
+
   showCopies(document);
   sayTimes(document);
   setInterval(() => sayTimes(document), 15000);

@@ -1,9 +1,9 @@
-// Pictures of grasps in lists: one small stage draws each picture when it scrolls into view.
+// Pictures of grasps, hands and objects in lists: one small stage draws each picture when it scrolls into view.
 import { Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { between, Hand, Thing } from "./figures.js";
 import { freeSide, staged } from "./scenery.js";
-import { besideHand, Stage } from "./stage.js";
+import { beforePalm, besideHand, Stage } from "./stage.js";
 
 const SIDE = 220;
 let stage = null;
@@ -15,30 +15,41 @@ function keep(address, Kind) {
   return figures.get(address);
 }
 
+/** Draw a stage with all its figures, and copy the picture. */
+function picture(canvas, shown, side, room) {
+  stage ??= new Stage();
+  stage.scene.add(...shown);
+  stage.size(SIDE, SIDE * 0.8, Math.min(devicePixelRatio, 2));
+  stage.frame(shown[0], side, room);
+  stage.draw();
+  canvas.width = stage.renderer.domElement.width;
+  canvas.height = stage.renderer.domElement.height;
+  canvas.getContext("2d").drawImage(stage.renderer.domElement, 0, 0);
+  stage.scene.remove(...shown);
+  canvas.dataset.state = "ready";
+}
+
+async function drawModel(canvas) {
+  const model = await loadGlb(canvas.dataset.model);
+  const made = model.extras.kind === "hand" ? new Hand(model) : new Thing(model);
+  if (made instanceof Hand) made.pose([0, 0, 0, 1, 0, 0, 0], model.extras.preshape);
+  picture(canvas, [made.group], made instanceof Hand ? beforePalm(made) : new Vector3(1, -1.5, 0.8), 0.9);
+}
+
 async function draw(canvas) {
+  if (canvas.dataset.model) return drawModel(canvas);
   const [grasp, hand, thing] = await Promise.all([
     fetch(canvas.dataset.grasp).then((answer) => (answer.ok ? answer.json() : Promise.reject(new Error(answer.status)))),
     keep(canvas.dataset.hand, Hand),
     keep(canvas.dataset.object, Thing),
   ]);
-  stage ??= new Stage();
-  const ratio = Math.min(devicePixelRatio, 2);
   const { pose, positions } = between(grasp.postures.grasp, grasp.postures.grasp, 0, grasp.joint_names);
   hand.pose(pose, positions);
   thing.group.position.set(0, 0, 0);
   const { all, scenery } = staged(grasp, hand, thing);
-  stage.scene.add(all);
-  if (scenery) stage.scene.add(scenery.group);
-  stage.size(SIDE, SIDE * 0.8, ratio);
   const beside = besideHand(hand);
-  stage.frame(all, grasp.scene ? freeSide(beside, grasp.scene, all.localToWorld(new Vector3())) : beside, 0.74);
-  stage.draw();
-  canvas.width = stage.renderer.domElement.width;
-  canvas.height = stage.renderer.domElement.height;
-  canvas.getContext("2d").drawImage(stage.renderer.domElement, 0, 0);
-  stage.scene.remove(all);
-  if (scenery) stage.scene.remove(scenery.group);
-  canvas.dataset.state = "ready";
+  const side = grasp.scene ? freeSide(beside, grasp.scene, all.localToWorld(new Vector3())) : beside;
+  picture(canvas, scenery ? [all, scenery.group] : [all], side, 0.74);
 }
 
 const seen = new IntersectionObserver((entries) => {
@@ -51,7 +62,7 @@ const seen = new IntersectionObserver((entries) => {
 }, { rootMargin: "300px" });
 
 function watch(root) {
-  for (const canvas of root.querySelectorAll("canvas[data-grasp]:not([data-state])")) {
+  for (const canvas of root.querySelectorAll(":is(canvas[data-grasp], canvas[data-model]):not([data-state], .viewer *)")) {
     canvas.dataset.state = "waiting";
     seen.observe(canvas);
   }

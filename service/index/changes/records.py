@@ -127,7 +127,7 @@ def shard_row(manifest: ShardManifest) -> Row:
         "id": manifest.shard_id,
         "stage": manifest.stage.value,
         "inputs": list(manifest.inputs),
-        "manifest": manifest.model_dump(mode="json", exclude={"grasps"}),
+        "manifest": manifest.model_dump(mode="json", exclude={"grasps": True, "info": {"log"}}),
     }
 
 

@@ -37,6 +37,17 @@ class Datasets(IndexPart):
             cells = select(dataset_cells.c.job_id).where(dataset_cells.c.dataset == name)
             return view.model_copy(update={"outcomes": outcomes_of(connection, tasks.c.job_id.in_(cells))})
 
+    def users_of(self, digests: Collection[str], *, scope: ProjectScope = EVERYTHING) -> dict[str, list[str]]:
+        """Return the names of the datasets in scope that use each hand or object, by its digest."""
+        used: dict[str, list[str]] = {digest: [] for digest in digests}
+        for column in (dataset_cells.c.hand_digest, dataset_cells.c.object_digest):
+            query = select(column.label("digest"), dataset_cells.c.dataset).distinct().where(column.in_(digests))
+            query = query.join(datasets, datasets.c.name == dataset_cells.c.dataset)
+            query = query.where(*scope_conditions(scope, datasets)).order_by(dataset_cells.c.dataset)
+            for row in self.database.rows(query):
+                used[row["digest"]].append(row["dataset"])
+        return used
+
     def unfinished(self, names: Collection[str]) -> set[str]:
         query = select(datasets).where(datasets.c.name.in_(sorted(names)))
         with self.database.read_transaction() as connection:

@@ -2,14 +2,16 @@
 
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
+from types import MappingProxyType
 from typing import Any, Final, Literal
 
-from sqlalchemy import Column, ColumnElement, Connection, Float, and_, case, cast, func, select
+from sqlalchemy import Column, ColumnElement, Connection, Float, case, cast, func, literal_column, select
 
 from graspd.service.index import database
-from graspd.service.index.tables import attempts, jobs, shards, tasks
+from graspd.service.index.tables import attempts, dataset_cells, jobs, shards, tasks
 from graspd.service.index.views import AttemptView, JobView, Page, ShardView, StageProgress, TaskView
-from graspd.service.model.planning import count_ranges, sum_outcomes
+from graspd.service.model.planning import count_ranges, phase_seconds, sum_outcomes
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.states import Stage, State
 
@@ -21,6 +23,16 @@ SHARE_DONE: Final[ColumnElement[float]] = case(
 )
 
 
+#: The shard of a task is reused if it is older than the task; both times are texts of one format.
+_REUSED: Final = tasks.c.done & (tasks.c.finished < tasks.c.created)
+#: Order by the time from the submission of a job to its end; unfinished jobs count as ending last.
+_DURATION: Final = {
+    "sqlite": "julianday(coalesce(jobs.finished, '9999-01-01')) - julianday(jobs.created)",
+    "postgresql": "extract(epoch from coalesce(jobs.finished, '9999-01-01')::timestamptz - jobs.created::timestamptz)",
+}
+JobSort = Literal["created", "hand", "object", "state", "duration"]
+
+
 class Jobs(database.IndexPart):
     def page(
         self,
@@ -29,28 +41,42 @@ class Jobs(database.IndexPart):
         hand: str | None = None,
         object: str | None = None,
         prefix: str = "",
+        words: Mapping[str, Collection[str]] = MappingProxyType({}),
+        sort: JobSort = "created",
+        descending: bool = True,
         limit: int = 50,
         cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[JobView]:
-        """Return a page of jobs, the newest first; `prefix` is the beginning of their ids."""
+        """Return a page of jobs, by default the newest first; `prefix` is the beginning of their ids.
+
+        Each of `words` occurs in hand, object or the name of a dataset, begins the id, or has ids of the owner.
+        """
         same = _equality_conditions({jobs.c.state: state, jobs.c.hand: hand, jobs.c.object: object})
-        query, key = select(jobs).where(*database.scope_conditions(scope, jobs), *same), (jobs.c.created, jobs.c.id)
+        query = select(jobs).where(*database.scope_conditions(scope, jobs), *same)
         query = query.where(jobs.c.id.startswith(prefix, autoescape=True)) if prefix else query
+        query = query.where(*(_contains_word(word, owners) for word, owners in words.items()))
+        page = partial(database.page_rows, limit=limit, cursor=cursor, descending=descending)
         with self.database.read_transaction() as connection:
-            rows, following = database.page_rows(connection, query, *key, limit=limit, cursor=cursor)
+            key: ColumnElement[Any] = jobs.c[sort] if sort != "duration" else _duration(connection)
+            rows, following = page(connection, query.add_columns(key) if sort == "duration" else query, key, jobs.c.id)
             return Page(items=_job_views(connection, rows), next=following)
 
-    def get(self, job_id: str, *, scope: ProjectScope = EVERYTHING) -> JobView:
+    def get(self, job_id: str, *, details: bool = False, scope: ProjectScope = EVERYTHING) -> JobView:
+        """Return a job; with `details`, and if it found too few grasps, also outcomes, phases and times."""
         with self.database.read_transaction() as connection:
             query = select(jobs).where(jobs.c.id == job_id, *database.scope_conditions(scope, jobs))
             (view,) = _job_views(connection, [self.database.first_row(query, f"job {job_id!r}", connection)])
-            more: dict[str, Any] = {}
+            if view.note is None and not details and not view.request.second_engines:
+                return view
+            own = tasks.c.job_id == job_id
+            infos = _infos_of(connection, own)
+            used = select(tasks.c.device, func.sum(tasks.c.seconds)).where(own, tasks.c.done, ~_REUSED)
+            seconds = {str(device): float(spent or 0) for device, spent in connection.execute(used.group_by("device"))}
+            found = {"outcomes": _sum_infos(infos), "phases": phase_seconds(*infos), "seconds_by_device": seconds}
             if view.request.second_engines:
-                more = outcomes_of(connection, tasks.c.job_id == job_id, "second_engine")
-            if view.note is not None:
-                more["outcomes"] = outcomes_of(connection, tasks.c.job_id == job_id)
-            return view.model_copy(update=more)
+                found |= sum_outcomes(info.get("second_engine") or {} for info in infos)
+            return view.model_copy(update=found)
 
     def unfinished(self, ids: Collection[str]) -> set[str]:
         query = select(jobs.c.id).where(jobs.c.finished.is_(None))
@@ -77,6 +103,17 @@ class Jobs(database.IndexPart):
         return [AttemptView(**row) for row in self.database.rows(query)]
 
 
+def _duration(connection: Connection) -> ColumnElement[float]:
+    return literal_column(_DURATION[connection.dialect.name], Float()).label("duration")
+
+
+def _contains_word(word: str, owners: Collection[str]) -> ColumnElement[bool]:
+    of_datasets = select(dataset_cells.c.job_id).where(dataset_cells.c.dataset.icontains(word, autoescape=True))
+    named = jobs.c.hand.icontains(word, autoescape=True) | jobs.c.object.icontains(word, autoescape=True)
+    begins = jobs.c.id.startswith(word.lower(), autoescape=True)
+    return named | begins | jobs.c.id.in_(of_datasets) | jobs.c.owner.in_(owners)
+
+
 def _equality_conditions(wanted: Mapping[Column[Any], str | None]) -> list[ColumnElement[bool]]:
     return [column == value for column, value in wanted.items() if value is not None]
 
@@ -100,15 +137,13 @@ def _with_pending_tasks(stage: StageProgress, tasks: int) -> StageProgress:
 
 
 def _stage_progress_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, list[StageProgress]]:
-    # The shard of a task is reused if it is older than the task; both times are texts of one format.
-    reused = and_(tasks.c.done, tasks.c.finished < tasks.c.created)
     group = (tasks.c.job_id, tasks.c.position, tasks.c.stage, tasks.c.state)
     query = select(
         *group,
         func.count().label("tasks"),
         func.sum(cast(SHARE_DONE, Float)).label("done"),
-        func.sum(case((reused, 0.0), else_=func.coalesce(tasks.c.seconds, 0.0))).label("seconds"),
-        func.sum(case((reused, 1), else_=0)).label("reused"),
+        func.sum(case((_REUSED, 0.0), else_=func.coalesce(tasks.c.seconds, 0.0))).label("seconds"),
+        func.sum(case((_REUSED, 1), else_=0)).label("reused"),
     )
     query = query.where(tasks.c.job_id.in_(ids)).group_by(*group)
     stages: dict[str, dict[int, dict[str, Any]]] = defaultdict(dict)
@@ -141,11 +176,19 @@ def _task_view(row: Any) -> TaskView:
 MOST_SHARDS: Final = 1000
 
 
-def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool], name: str = "outcomes") -> dict[str, int]:
-    """Sum counts in at most `MOST_SHARDS` shards of the selected jobs: rejected candidates by outcome, or others."""
-    query = select(shards.c.manifest["info"][name]).join(tasks, tasks.c.shard_id == shards.c.id)
+def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[str, int]:
+    """Count rejected candidates by outcome in at most `MOST_SHARDS` shards of the selected jobs."""
+    return _sum_infos(_infos_of(connection, of_jobs))
+
+
+def _infos_of(connection: Connection, of_jobs: ColumnElement[bool]) -> list[dict[str, Any]]:
+    query = select(shards.c.manifest["info"]).join(tasks, tasks.c.shard_id == shards.c.id)
     query = query.where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value).limit(MOST_SHARDS)
-    return sum_outcomes(one for one in connection.scalars(query) if isinstance(one, dict))
+    return [info for info in connection.scalars(query) if isinstance(info, dict)]
+
+
+def _sum_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    return sum_outcomes(info.get("outcomes") or {} for info in infos)
 
 
 class Shards(database.IndexPart):

@@ -5,17 +5,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Connection, Select, Table, case, func, select
+from sqlalchemy import ColumnElement, Connection, Select, Table, case, func, literal, select
 
 from graspd.service.index.database import (
     Database,
     IndexPart,
+    asset_scope_conditions,
     page_size,
     scope_conditions,
     scope_conditions_by_job,
     shard_scope_conditions,
 )
-from graspd.service.index.tables import attempts, damage, jobs, shards, spent, tasks, workers
+from graspd.service.index.tables import assets, attempts, damage, datasets, jobs, shards, spent, tags, tasks, workers
 from graspd.service.index.views import FailureGroup, MatrixCell, Stats, UsageDay, WorkerView
 from graspd.service.model.clock import age_of, timestamp
 from graspd.service.model.domain import JobRequest
@@ -28,6 +29,19 @@ class Overview(IndexPart):
     def workers(self) -> list[WorkerView]:
         query = select(workers).order_by(case((workers.c.state == "lost", 1), else_=0), workers.c.name)
         return [WorkerView(**row) for row in self.database.rows(query)]
+
+    def names(self, text: str, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[tuple[str, str]]:
+        """Return kind and name of datasets, assets and tags whose names contain a text."""
+        sources = (
+            (literal("dataset"), datasets.c.name, scope_conditions(scope, datasets)),
+            (assets.c.kind, assets.c.name, asset_scope_conditions(scope)),
+            (literal("tag"), tags.c.name, scope_conditions(scope, tags)),
+        )
+        found = []
+        for kind, name, in_scope in sources:
+            query = select(kind.label("kind"), name).distinct().where(name.icontains(text, autoescape=True), *in_scope)
+            found += [(row["kind"], row["name"]) for row in self.database.rows(query.order_by(name).limit(limit))]
+        return found
 
     def stats(self, *, scope: ProjectScope = EVERYTHING) -> Stats:
         alive = select(func.count()).select_from(workers).where(workers.c.state != "lost")
@@ -215,9 +229,13 @@ class BatchCost:
 
 
 class Costs(IndexPart):
-    def batch_costs(self, stage: Stage, *, limit: int = _NEWEST, scope: ProjectScope = EVERYTHING) -> list[BatchCost]:
+    def batch_costs(
+        self, stage: Stage, *, limit: int = _NEWEST, before: str = "", scope: ProjectScope = EVERYTHING
+    ) -> list[BatchCost]:
+        """Return the newest finished tasks of a stage, if given of those made before a time."""
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
         query = select(*columns, shards.c.manifest["request"].label("request"))
         query = query.where(shards.c.kind == SHARD_KINDS[stage], *shard_scope_conditions(scope, shards.c.id))
+        query = query.where(shards.c.created < before) if before else query
         rows = self.database.rows(query.order_by(shards.c.created.desc(), shards.c.id.desc()).limit(limit))
         return [BatchCost(**{**row, "request": JobRequest.model_validate(row["request"])}) for row in rows]

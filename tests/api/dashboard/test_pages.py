@@ -49,11 +49,11 @@ def test_home_shows_jobs_workers_and_failures(http: TestClient, services: Servic
     assert f'href="/jobs/{record.id}"' in page and "worker-7" in page and "the mesh has 12 open edges" in page
 
 
-def test_home_filters_by_state(http: TestClient, services: Services) -> None:
+def test_jobs_are_filtered_by_state(http: TestClient, services: Services) -> None:
     empty = http.get("/").text
     assert "graspd submit" in empty and "graspd worker" in empty, "it says what to do"
     add_job(services)
-    shown = [state for state in State if "allegro" in http.get("/", params={"state": state.value}).text]
+    shown = [state for state in State if "allegro" in http.get("/jobs", params={"state": state.value}).text]
     assert shown == [State.QUEUED]
 
 

@@ -19,8 +19,9 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
 from graspd.service.pipeline.job_actions import Routes
 from graspd.service.pipeline.lease_reaper import LOST_AFTER_S
-from graspd.service.queue.port import Event, EventKind
+from graspd.service.queue.port import Event, EventKind, rq_id
 from graspd.service.store.library import publish_asset, stored_assets
+from graspd.service.store.records import task_attempts
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages.context import StopReason, TaskContext
@@ -152,12 +153,15 @@ def test_a_worker_that_was_only_slow_changes_nothing(bench: Bench) -> None:
 
 def test_a_task_that_kills_every_worker_stops_after_its_attempts(bench: Bench) -> None:
     job, _ = job_actions.submit(bench.services, request(scenes=1))
+    task = bench.services.index.jobs.tasks(job=job.id).items[0].id
+    bench.services.queue.put_task_log(rq_id(task, 1), "its last line")
     bench.lose_workers()
     failed = bench.services.index.jobs.get(job.id)
     assert failed.state is State.FAILED
     assert failed.reason is not None and "was lost: no heartbeat for 6 s" in failed.reason
     attempts = bench.services.index.jobs.attempts(job=job.id)
     assert [(a.number, a.kind, a.last) for a in attempts] == [(n, "WorkerLost", n == 3) for n in (3, 2, 1)]
+    assert [a.log for a in task_attempts(bench.services.store, task)] == ["its last line", "", ""]
     assert differences(bench.services.index, bench.services.store) == []
 
 

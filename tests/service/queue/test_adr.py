@@ -33,8 +33,8 @@ from graspd.service.pipeline.indexer import Indexer
 from graspd.service.pipeline.leading import PART
 from graspd.service.pipeline.lease_reaper import LeaseReaper
 from graspd.service.queue.entries import TASK_FUNCTION, lease_registry_key, queue_name, sanitized_job
-from graspd.service.queue.port import Event, EventKind
-from graspd.service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, cancel_key, rq_id, worker_key
+from graspd.service.queue.port import Event, EventKind, rq_id
+from graspd.service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, cancel_key, worker_key
 from tests.conftest import PACKAGES, REPOSITORY
 from tests.fakes import beat_of, request
 from tests.service.conftest import service

@@ -24,6 +24,8 @@ from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import EventKind
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
+from graspd.service.store.manifests import load_manifest
+from graspd.service.store.records import task_attempts
 from graspd.service.store.store import open_store
 from graspd.worker.engines.devices import Device
 from graspd.worker.process import engine, main
@@ -32,6 +34,7 @@ from graspd.worker.process.heartbeat import Heartbeat
 from graspd.worker.process.link import EngineLost, Link, Setup, is_stopped
 from graspd.worker.process.main import GraspWorker, run_worker
 from graspd.worker.process.runner import Runner
+from graspd.worker.process.task_log import LINE_CHARACTERS, LINES
 from graspd.worker.stages.context import StopReason, TaskContext
 from tests.fakes import beat_of, engine_of, fake_synthesize, message_for
 from tests.waiting import until
@@ -106,7 +109,8 @@ def test_a_lease_that_was_taken_is_not_made_again(start: Start) -> None:
     worker.queue.release(lease)
     until(lambda: worker.states() == ["idle"], "the task stops")
     assert worker.queue.leases() == [] and worker.events()[-1] is EventKind.STARTED, "it is another's now"
-    assert [key for key in worker.queue.connection.keys("*") if TASK.task_id.encode() in key] == []
+    left = [key for key in worker.queue.connection.keys("*") if TASK.task_id.encode() in key]
+    assert left == [f"graspd:log:{TASK.task_id}-1".encode()]
 
 
 def test_a_lease_is_kept_while_the_engine_lets_nothing_else_run(start: Start) -> None:
@@ -296,6 +300,41 @@ def _waits(redis: Any, entry: str | bytes) -> None:
 def _job(redis: Any, function: str, *arguments: Any) -> str:
     queue = Queue("bulk-synthesize", connection=redis, serializer=JSONSerializer)
     return str(queue.enqueue_call(function, args=arguments).id)
+
+
+def test_a_task_leaves_its_log_where_it_is_read(rq_queue: RqQueue, work: Any, tmp_path: Path) -> None:
+    message, seen = message_for(), []
+
+    def stage(task: TaskMessage, context: TaskContext):
+        for n in range(2 * LINES):
+            logging.getLogger("graspd.worker").info("line %d of redis://user:hunter2@host and %s", n, "x" * 999)
+        context.progress(1, 4, "descending")
+        until(lambda: seen.append(rq_queue.task_log(f"{message.task_id}-1")) or seen[-1], "the log of a running task")
+        return fake_synthesize(task, context)
+
+    logging.getLogger().setLevel(logging.INFO)
+    rq_queue.enqueue([message], Priority.BULK)
+    assert work({Stage.SYNTHESIZE: stage})
+    store = open_store(Settings(data_dir=tmp_path).resolved_store_url)
+    kept = load_manifest(store, message.stage, message.output).info["log"]
+    whole = rq_queue.task_log(f"{message.task_id}-1")
+    assert kept.splitlines()[-2:] == whole.splitlines()[-3:-1], "the line of the runner's end comes after it"
+    assert "25% descending" in kept and "computed in" in kept
+    assert len(kept.splitlines()) == LINES and max(map(len, kept.splitlines())) <= LINE_CHARACTERS
+    assert "hunter2" not in f"{seen}{kept}{whole}" and "***@host" in kept
+    assert rq_queue.connection.ttl(f"graspd:log:{message.task_id}-1") > 0
+
+
+def test_a_failed_attempt_keeps_its_log(rq_queue: RqQueue, work: Any, tmp_path: Path) -> None:
+    def stage(task: TaskMessage, context: TaskContext):
+        logging.getLogger("graspd.worker").warning("about to break")
+        raise ValueError("it broke")
+
+    rq_queue.enqueue([TASK], Priority.BULK)
+    assert work({Stage.SYNTHESIZE: stage})
+    (attempt,) = task_attempts(open_store(Settings(data_dir=tmp_path).resolved_store_url), TASK.task_id)
+    assert "WARNING graspd.worker about to break" in attempt.log
+    assert attempt.log.splitlines()[-1] == "ValueError: it broke"
 
 
 FORGERIES: dict[str, Callable[[Any, Path], object]] = {

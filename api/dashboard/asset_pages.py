@@ -1,6 +1,8 @@
-"""Pages of hands: the list, and one hand in 3D with a form to correct guesses about it."""
+"""Pages of hands and objects: lists, an object in 3D, a hand with a form to correct guesses."""
 
 from collections.abc import Iterator
+from contextlib import suppress
+from functools import lru_cache
 from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request
@@ -16,47 +18,96 @@ from graspd.service.index.views import AssetView
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.asset_summary import hand_line, payload_line, self_test_line
+from graspd.service.store.assets import BUILTIN_LICENCE
 from graspd.service.store.descriptions import MAX_ENTRIES, HandFacts
 
 PAGE_SIZE: Final = 50
 _CHECK_S: Final = 2
 _MAX_FIELDS: Final = 16 + 3 * MAX_ENTRIES
+_COUNTED: Final = (("dofs", "Joints"), ("fingertips", "Fingertips"))
+CursorParameter = Annotated[str | None, Query(max_length=512)]
 
-router = APIRouter(prefix="/hands", include_in_schema=False)
+router = APIRouter(include_in_schema=False)
 
 
-@router.get("", dependencies=READ)
-def hands_page(
-    request: Request, assets: AssetsOf, cursor: Annotated[str | None, Query(max_length=512)] = None
-) -> HTMLResponse:
+@router.get("/hands", dependencies=READ)
+def hands_page(request: Request, assets: AssetsOf, cursor: CursorParameter = None) -> HTMLResponse:
     """Show all hands, also refused ones; their pages state the reason."""
-    page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor, refused=True)
-    # `facts` contains data from the upload, so that values may be of any type.
-    facts = {hand.digest: [hand.facts.get(name) for name in ("dofs", "fingertips")] for hand in page.items}
-    numbers = {key: [len(one) if isinstance(one, list) else 0 for one in found] for key, found in facts.items()}
     networks = [] if cursor else assets.page(AssetKind.NETWORK, limit=PAGE_SIZE).items
+    about = {"networks": networks, "network_hands": {one.digest: hand_line(one.facts) for one in networks}}
+    return _render_list(request, assets, AssetKind.HAND, cursor, **about)
+
+
+@router.get("/objects", dependencies=READ)
+def objects_page(request: Request, assets: AssetsOf, cursor: CursorParameter = None) -> HTMLResponse:
+    """Show all objects, also refused ones; their pages state the reason."""
+    return _render_list(request, assets, AssetKind.OBJECT, cursor, networks=[])
+
+
+def _render_list(request: Request, assets: Assets, kind: AssetKind, cursor: str | None, **context: Any) -> HTMLResponse:
+    page = assets.page(kind, limit=PAGE_SIZE, cursor=cursor, refused=True)
     return render(
         request,
-        "hands.html",
-        page="/hands",
+        "assets.html",
+        page=f"/{kind.value}s",
         poll_s=2 * _CHECK_S,
-        hands=page.items,
-        numbers=numbers,
+        kind=kind.value,
+        assets=[(one, _short_facts(assets, one)) for one in page.items],
         next=page.next,
-        self_tests={hand.digest: self_test_line(hand.facts) for hand in page.items},
-        networks=networks,
-        network_hands={network.digest: hand_line(network.facts) for network in networks},
+        datasets=assets.datasets_of([one.digest for one in page.items]),
+        self_tests={one.digest: self_test_line(one.facts) for one in page.items},
+        **context,
     )
 
 
-@router.get("/{name}", dependencies=READ)
+def _short_facts(assets: Assets, asset: AssetView) -> list[tuple[str, str]]:
+    """Return labels and texts. `facts` contains data from the upload, so values may be of any type."""
+    facts = asset.facts
+    if asset.builtin and asset.kind is AssetKind.HAND:
+        facts = _builtin_facts(assets, asset.digest) | facts
+    rows = [(label, str(len(one))) for name, label in _COUNTED if isinstance(one := facts.get(name), list)]
+    if isinstance(opening := facts.get("opening_m"), int | float):
+        rows.append(("Opening", f"{1e3 * opening:.0f} mm"))
+    if isinstance(extents := facts.get("extents_m"), list):
+        rows.append(("Size", " × ".join(f"{1e3 * one:.0f}" for one in extents if isinstance(one, int | float)) + " mm"))
+    if isinstance(mass := facts.get("mass_kg"), int | float):
+        rows.append(("Mass", f"{mass:.3g} kg"))
+    licence = facts.get("licence") or (BUILTIN_LICENCE if asset.builtin else "not stated")
+    return [*rows, ("Licence", str(licence))]
+
+
+@lru_cache(maxsize=16)
+def _builtin_facts(assets: Assets, digest: str) -> dict[str, Any]:
+    """Return the facts of a built-in hand from its model, because it has no check."""
+    with suppress(NotFoundError, ConflictError):
+        return assets.hand_facts(assets.get(AssetKind.HAND, digest)).model_dump()
+    return {}
+
+
+@router.get("/objects/{name}", dependencies=READ)
+def object_page(request: Request, name: str, assets: AssetsOf) -> HTMLResponse:
+    found = assets.get(AssetKind.OBJECT, name)
+    checked = found.builtin or found.verdict is not None
+    return render(
+        request,
+        "object.html",
+        page="/objects",
+        poll_s=0 if checked else _CHECK_S,
+        object=found,
+        checked=checked,
+        facts=_short_facts(assets, found),
+        datasets=assets.datasets_of([found.digest])[found.digest],
+    )
+
+
+@router.get("/hands/{name}", dependencies=READ)
 def hand_page(request: Request, name: str, assets: AssetsOf) -> HTMLResponse:
     hand = assets.get(AssetKind.HAND, name)
     facts, trouble = _load_facts(assets, hand)
     return _render_hand(request, hand, facts, problem=trouble, form=_form_of(facts) if facts else {})
 
 
-@router.post("/{name}", dependencies=SUBMIT, response_model=None)
+@router.post("/hands/{name}", dependencies=SUBMIT, response_model=None)
 async def correct(request: Request, name: str, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
     async with request.form(max_files=0, max_fields=_MAX_FIELDS) as fields:
         return await request.app.state.uploads.run(_correct, request, assets, name, fields)
@@ -94,6 +145,8 @@ def _render_hand(
         form=form,
         guessed=guessed if isinstance(guessed, list) else [],
         self_test=self_test_line(hand.facts),
+        short_facts=_short_facts(request.app.state.assets, hand),
+        datasets=request.app.state.assets.datasets_of([hand.digest])[hand.digest],
         limit=payload_line(hand.facts),
     )
 

@@ -1,0 +1,74 @@
+"""List of jobs: search, order, and changes of the selected jobs."""
+
+from typing import Annotated, Final
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, Request
+from fastapi.responses import HTMLResponse, RedirectResponse
+from starlette.datastructures import FormData
+
+from graspd.api.dashboard.forms import fields_of
+from graspd.api.dashboard.rendering import render
+from graspd.api.routes.dependencies import READ, SUBMIT, JobsOf, next_address
+from graspd.service.model.errors import InputError
+from graspd.service.model.states import State
+
+#: Number of jobs on a page, and thus the maximum number changed by one request.
+PAGE_SIZE: Final = 100
+#: Columns with an order, and their titles.
+SORTS: Final = {"hand": "Job", "state": "State", "duration": "Duration", "created": "Created"}
+_DONE: Final = {"cancel": "cancelled", "retry": "queued again", "delete": "deleted"}
+
+router = APIRouter(prefix="/jobs", include_in_schema=False)
+
+
+@router.get("", dependencies=READ, response_model=None)
+def jobs_page(request: Request, jobs: JobsOf) -> HTMLResponse | RedirectResponse:
+    """List jobs; the URL has the search, the state and the order, without empty fields."""
+    given = {key: value for key, value in request.query_params.items() if value}
+    if len(given) < len(request.query_params):
+        return RedirectResponse(f"/jobs?{urlencode(given)}" if given else "/jobs", status_code=303)
+    did, done, why, cursor = (given.pop(key, "") for key in ("did", "done", "why", "cursor"))
+    state, sort, words = given.get("state", ""), given.get("sort", ""), given.get("q", "")[:200].split()
+    owners = {key.id: key.name for key in request.app.state.keys.list()}
+    page = jobs.page(
+        words={word: [id for id, name in owners.items() if word.lower() in name.lower()] for word in words},
+        state=State(state) if state in set(State) else None,
+        sort=sort if sort in SORTS else "created",
+        descending=given.get("order") != "asc",
+        limit=PAGE_SIZE,
+        cursor=cursor or None,
+    )
+    return render(
+        request,
+        "jobs.html",
+        page="/jobs",
+        events="/events",
+        refresh_s=5,
+        jobs=page.items,
+        next=next_address(request, page.next) if page.next else None,
+        given=given,
+        sorts=SORTS,
+        states=("", *State),
+        owners=owners,
+        did=f"{int(done):,} {'job' if done == '1' else 'jobs'} {_DONE[did]}."
+        if did in _DONE and done.isdigit()
+        else "",
+        why=why[:300],
+    )
+
+
+@router.post("/act", dependencies=SUBMIT)
+def act(jobs: JobsOf, fields: Annotated[FormData, fields_of(PAGE_SIZE + 5)], action: str = "") -> RedirectResponse:
+    """Cancel, retry or delete the selected jobs; deletion asks for their number."""
+    chosen = [str(one) for one in fields.getlist("job")]
+    if action not in _DONE or not chosen:
+        raise InputError("no job is selected; select some")
+    if action == "delete" and str(fields.get("typed", "")).strip() != str(len(chosen)):
+        raise InputError(f"nothing was deleted; to delete {len(chosen)} jobs, type {len(chosen)}")
+    changed, problems = jobs.change(action, chosen)
+    said = {"did": action, "done": changed}
+    if problems:
+        said["why"] = f"{len(problems)} unchanged, for example: {problems[0]}"[:300]
+    query = str(fields.get("query", ""))[:1000]
+    return RedirectResponse(f"/jobs?{urlencode(said)}" + (f"&{query}" if query else ""), status_code=303)
