@@ -139,6 +139,29 @@ class Waypoint(BaseModel):
     carried: list[float] = Field(description="displacement of the object from rest: x y z [m]")
 
 
+class ReplayPoint(BaseModel):
+    """State of a replayed validation, in the frame of the object at rest [m, N, N m]."""
+
+    name: str = Field(description="named posture of `Waypoint`, or pushes; empty between them")
+    place: float = Field(description="position on the slider of `Waypoint`")
+    phase: str = Field(description="approach, closing, lifting, holding, or the direction of a push")
+    hand_pose: list[float]
+    joint_positions: list[float]
+    object_pose: list[float] = Field(description="pose relative to rest: x y z [m], quaternion w x y z")
+    contacts: list[list[float]] = Field([], description="contacts of the hand: position, inward normal, force on it")
+    hand_force: list[float] | None = Field(None, description="sum of the hand's contact forces on the object")
+    support_force: list[float] | None = Field(None, description="sum of other contact forces on the object")
+    load: list[float] | None = Field(None, description="weight or push at the object's centre of mass")
+    torque: list[float] | None = Field(None, description="sum of contact torques about the centre of mass")
+
+
+class GraspReplay(BaseModel):
+    """Validation of a grasp, simulated again in MuJoCo at nominal friction."""
+
+    outcome: str
+    way: list[ReplayPoint]
+
+
 class Neighbour(BaseModel):
     """Neighbour of the target in a scene."""
 

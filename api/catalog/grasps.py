@@ -1,6 +1,8 @@
 """Grasps: search by metrics, distributions of a job, and details of one grasp from its base shard."""
 
 import math
+import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import zip_longest
@@ -8,13 +10,15 @@ from typing import Any, Final, Literal
 
 from graspd.api import models
 from graspd.api.access.auth import project_scope
+from graspd.service import user_cache
 from graspd.service.index.queries.grasps import GraspFilter, GraspSort, Metric
 from graspd.service.index.queries.statistics import GraspKinds
 from graspd.service.index.views import GraspView, JobView, Page
 from graspd.service.model import metrics
-from graspd.service.model.errors import InputError, LimitError, NotFoundError
+from graspd.service.model.errors import InputError, LimitError, NotFoundError, UnavailableError
 from graspd.service.model.records import MOST_TAGGED, Grasp
 from graspd.service.model.scene_spec import scene_supports
+from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.pipeline.backends import Services
 from graspd.service.readers.trajectories import planned_scene_of, slider_positions, trajectory_of
 from graspd.service.store.columns import LIFT_OUTCOMES, PUSH_OUTCOMES
@@ -25,6 +29,9 @@ _KEPT_STATISTICS: Final = 256
 #: Number of cached base shards. A shard of 32 grasps takes about 60 kB; a page needs at most one shard per row.
 _KEPT_SHARDS: Final = 64
 _BINS: Final = 20
+#: Time limit of a replay [s], which takes about 2 s of CPU time, and the limit of kept replays [bytes].
+_REPLAY_S: Final = 60.0
+_REPLAYS_BYTES: Final = 64 << 20
 _SHARED: Final = GraspFilter.model_fields.keys() & models.GraspQuery.model_fields.keys()
 MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(
     metric.name for metric in metrics.indexed_metrics(metrics.IndexLevel.OFFERED)
@@ -98,6 +105,26 @@ class Grasps:
             return read_shard(data, kind="base", name=key)
         except InputError as error:
             raise NotFoundError(f"{key} holds no grasps that can be shown: {error}") from None
+
+    def replay(self, shard_id: str, row: int) -> bytes:
+        """Return the JSON of a `GraspReplay`, simulated by a child process or kept from an earlier call.
+        Raises UnavailableError: this machine lacks the engine, or the simulation failed or took too long."""
+        self._index.grasps.get(shard_id, row, scope=project_scope())
+        kept = user_cache.cache_folder("replays") / f"{shard_id}-{row}-{PACKAGE_VERSION}.json"
+        if (known := user_cache.load(kept)) is not None:
+            return known
+        command = [sys.executable, "-m", "graspd.worker.stages.replay", self._store.url, shard_id, str(row)]
+        try:
+            found = subprocess.run(
+                command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_REPLAY_S, check=True
+            )
+        except subprocess.CalledProcessError as error:
+            why = error.stderr.decode(errors="replace").strip().splitlines()[-1:] or [str(error)]
+            raise UnavailableError(f"the API's machine cannot simulate this grasp: {why[0][:300]}") from None
+        except subprocess.TimeoutExpired:
+            raise UnavailableError(f"the simulation takes longer than {_REPLAY_S:.0f} s; try again later") from None
+        user_cache.store(kept, found.stdout, limit_bytes=_REPLAYS_BYTES)
+        return found.stdout
 
     def statistics(self, job: JobView | models.JobDetail) -> tuple[list[models.Histogram], models.Diversity | None]:
         """Return distributions and diversity of a job's valid grasps; without validation, of all stored ones."""
