@@ -109,7 +109,9 @@ class GraspQuery(BaseModel):
     validated: bool | None = Field(None, description="whether the validator gave a verdict")
     valid: bool | None = Field(None, description="false: validated, but not valid")
     success: bool | None = None
-    type: Literal["power", "precision", "lateral"] | None = Field(None, description="grasp type")
+    type: Literal["power", "precision", "pinch", "lateral"] | None = Field(
+        None, description="grasp type; pinch: precision with thumb and one finger"
+    )
     scene: Literal["free", "table", "bin", "shelf", "file", "any"] | None = Field(
         None, description="kind of the scene in which it was planned; any: all kinds except free"
     )

@@ -84,21 +84,21 @@ class Statistics(IndexPart):
         return found
 
     def _sampled_values(self, where: GraspFilter, metrics: Sequence[Metric], at_most: int) -> NDArray[np.float64]:
+        rows, _ = self.sample(where, metrics, at_most)
+        return np.array([tuple(row) for row in rows], float).reshape(-1, len(metrics))
+
+    def sample(self, where: GraspFilter, columns: Sequence[str], at_most: int) -> tuple[Sequence[Any], float]:
+        """Return columns of a fair sample of about `at_most` grasps, and the share of the shards in the sample."""
         with self.database.read_transaction() as connection:
-            query = select(*(grasps.c[metric] for metric in metrics)).where(
-                *_sample_conditions(connection, where, at_most)
-            )
-            rows = [tuple(row) for row in connection.execute(query)]
-        return np.array(rows, float).reshape(-1, len(metrics))
+            tests, share = _sample_conditions(connection, where, at_most)
+            return connection.execute(select(*(grasps.c[name] for name in columns)).where(*tests)).all(), share
 
     def kinds(self, where: GraspFilter, *, at_most: int = 20_000) -> GraspKinds:
         """Count types and approach cells of about `at_most` grasps, sampled as in `compare_distributions`."""
         columns = grasps.c.grasp_type, grasps.c.approach_cell
         with self.database.read_transaction() as connection:
-            query = (
-                select(*columns, func.count()).where(*_sample_conditions(connection, where, at_most)).group_by(*columns)
-            )
-            rows = connection.execute(query).all()
+            tests, _ = _sample_conditions(connection, where, at_most)
+            rows = connection.execute(select(*columns, func.count()).where(*tests).group_by(*columns)).all()
         found = GraspKinds({}, {})
         for kind, cell, count in rows:
             for counts, value in ((found.types, kind), (found.cells, cell)):
@@ -107,12 +107,18 @@ class Statistics(IndexPart):
         return found
 
 
-def _sample_conditions(connection: Connection, where: GraspFilter, at_most: int) -> list[ColumnElement[bool]]:
-    """Return the conditions of a filter, restricted to a share of the shards with about `at_most` grasps."""
-    group = "job" if where.job is not None else "dataset" if where.dataset is not None else "pair"
-    share = min(1.0, at_most / max(1, estimate_row_count(connection, where, group)))
-    tests = [c.sql(["job", "dataset"]) for c in conditions(where)]
-    return [*tests, grasps.c.shard_id < f"{round(share * 16**8):08x}"] if share < 1.0 else tests
+def _sample_conditions(
+    connection: Connection, where: GraspFilter, at_most: int
+) -> tuple[list[ColumnElement[bool]], float]:
+    """Return the conditions of a filter, restricted to a share of the shards with about `at_most` grasps; the share."""
+    groups = [name for name in ("job", "dataset", "tag") if getattr(where, name) is not None] or ["pair"]
+    least = min(estimate_row_count(connection, where, group) for group in groups)
+    share = min(1.0, at_most / max(1, least))
+    tests = [c.sql(["job", "dataset", "tag"]) for c in conditions(where)]
+    if share == 1.0:
+        return tests, share
+    bound = round(share * 16**8)
+    return [*tests, grasps.c.shard_id < f"{bound:08x}"], bound / 16**8
 
 
 def _distribution(values: NDArray[np.float64], bins: int, ends: tuple[float, float]) -> Distribution | None:

@@ -1,0 +1,53 @@
+// Contact forces of a replay: arrows of force and normal at each contact of the hand, and a table of the wrenches.
+import { Group, Vector3 } from "./vendor/three.min.js";
+import { Arrow } from "./marks.js";
+
+const COLOURS = { force: 0xdd7432, normal: 0x3566c8 };
+const NORMAL_M = 0.02, LONGEST_M = 0.06, LEAST_N = 0.01;
+const length = (sum) => Math.hypot(...sum);
+
+export class Forces {
+  /** `way` gives the largest force, which has the longest arrow. */
+  constructor(way) {
+    const sizes = way.points.flatMap((point) => (point.contacts ?? []).map((one) => length(one.slice(6, 9))));
+    this.scale = LONGEST_M / Math.max(...sizes, 1);
+    this.group = new Group();
+    this.arrows = [];
+  }
+
+  show(point) {
+    const drawn = (point.contacts ?? []).flatMap(([x, y, z, nx, ny, nz, fx, fy, fz]) => [
+      ["normal", [x, y, z], [nx, ny, nz], NORMAL_M],
+      ["force", [x, y, z], [fx, fy, fz], this.scale * length([fx, fy, fz])],
+    ]).filter(([, , , size]) => size > LEAST_N * this.scale);
+    while (this.arrows.length < drawn.length) {
+      const made = { force: new Arrow(COLOURS.force), normal: new Arrow(COLOURS.normal) };
+      this.arrows.push(made);
+      this.group.add(made.force.group, made.normal.group);
+    }
+    this.arrows.forEach((both, k) => {
+      for (const [kind, arrow] of Object.entries(both)) {
+        arrow.group.visible = drawn[k]?.[0] === kind;
+        if (!arrow.group.visible) continue;
+        const [, at, along, size] = drawn[k];
+        arrow.place(new Vector3(...at), new Vector3(...along).normalize(), size);
+      }
+    });
+  }
+
+  /** Fill the table of wrenches: forces of hand and supports, weight or push, what is left; sum of contact torques. */
+  static tell(table, point, scene) {
+    table.hidden = !point.load;
+    if (!point.load) return;
+    const left = point.load.map((value, k) => value + point.hand_force[k] + point.support_force[k]);
+    const rows = { hand: point.hand_force, supports: point.support_force, [scene ? "weight" : "push"]: point.load, remaining: left };
+    if (!scene) delete rows.supports;
+    rows["torque [N mm]"] = point.torque.map((value) => 1000 * value);
+    table.tBodies[0].replaceChildren(...Object.entries(rows).map(([name, values]) => {
+      const row = document.createElement("tr");
+      row.append(Object.assign(document.createElement("th"), { scope: "row", textContent: name }));
+      for (const value of [...values, length(values)]) row.append(Object.assign(document.createElement("td"), { className: "num", textContent: value.toFixed(2) }));
+      return row;
+    }));
+  }
+}
