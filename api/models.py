@@ -144,17 +144,16 @@ class Waypoint(BaseModel):
 class ReplayPoint(BaseModel):
     """State of a replayed validation, in the frame of the object at rest [m, N, N m]."""
 
-    name: str = Field(description="named posture of `Waypoint`, or pushes; empty between them")
-    place: float = Field(description="position on the slider of `Waypoint`")
+    name: str = Field(description="named posture as in `Waypoint`, or pushes; empty between them")
+    place: float = Field(description="position on the slider of `Waypoint`; all after the squeeze takes one unit")
     phase: str = Field(description="approach, closing, lifting, holding, or the direction of a push")
     hand_pose: list[float]
     joint_positions: list[float]
-    object_pose: list[float] = Field(description="pose relative to rest: x y z [m], quaternion w x y z")
-    contacts: list[list[float]] = Field([], description="contacts of the hand: position, inward normal, force on it")
-    hand_force: list[float] | None = Field(None, description="sum of the hand's contact forces on the object")
-    support_force: list[float] | None = Field(None, description="sum of other contact forces on the object")
+    object_pose: list[float] = Field(description="pose relative to rest: x y z, quaternion w x y z")
+    contacts: list[list[float]] = Field(
+        [], description="contacts of the object: position, inward normal, force on it, torque, 1 if the hand touches"
+    )
     load: list[float] | None = Field(None, description="weight or push at the object's centre of mass")
-    torque: list[float] | None = Field(None, description="sum of contact torques about the centre of mass")
 
 
 class GraspReplay(BaseModel):

@@ -3,7 +3,7 @@
 Counts of a facet ignore the facet's own filter, so they tell what another choice would find. They come from a sample of
 about `SAMPLE` grasps in memory, and are estimates for larger lists."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -14,96 +14,44 @@ from graspd.api.models import GraspQuery
 from graspd.service.model.metrics import AXIS_MEANINGS, GraspMetric, GraspType, IndexLevel, indexed_metrics
 
 #: Number of grasps from which facets are counted: reading more than these takes longer than a page may.
-SAMPLE: Final = 5000
+SAMPLE: Final = 4000
 BINS: Final = 24
-METRICS: Final = indexed_metrics(IndexLevel.OFFERED)
-_FLAGS: Final = ("valid", "success", "grasp_type", "digits", "neighbours", "lift_hard")
+_METRICS: Final = indexed_metrics(IndexLevel.OFFERED)
 _WORDS: Final = ("hand", "object", "scene_kind", "robust_weakest")
-COLUMNS: Final = (*_WORDS, *_FLAGS, *(metric.name for metric in METRICS))
-#: Digits of a pinch: two, one of them the thumb.
+_NUMBERS: Final = ("valid", "success", "grasp_type", "digits", "neighbours", "lift_hard")
+COLUMNS: Final = (*_WORDS, *_NUMBERS, *(metric.name for metric in _METRICS))
+#: Codes of the digits of a pinch: the thumb and one other.
 PINCH: Final = tuple(1 + (1 << finger) for finger in range(1, 6))
+#: Values of each facet in words, with the fields of the query that select them.
+_FACETS: Final[dict[str, list[tuple[str, dict[str, str]]]]] = {
+    "Verdict": [("valid", {"valid": "true"}), ("rejected", {"valid": "false"}), ("not judged", {"validated": "false"})],
+    "Type": [
+        ("power: palm or whole fingers", {"type": "power"}),
+        ("precision: fingertips", {"type": "precision"}),
+        ("pinch: thumb and one fingertip", {"type": "pinch"}),
+        ("lateral: sides of fingers", {"type": "lateral"}),
+    ],
+    "Scene": [
+        ("none: free object", {"scene": "free"}),
+        ("any scene", {"scene": "any"}),
+        *((kind, {"scene": kind}) for kind in ("table", "bin", "shelf")),
+        ("from a file", {"scene": "file"}),
+    ],
+    "Neighbours": [("some", {"neighbours": "true"}), ("none", {"neighbours": "false"})],
+    "Lift at half friction": [("lifted", {"lift_hard": "true"}), ("not lifted", {"lift_hard": "false"})],
+    "First failure": [(words, {"robust_weakest": axis.word}) for axis, words in AXIS_MEANINGS.items()],
+}
+_TRUTHS: Final = {"true": 1, "false": 0}
 
 Mask = NDArray[np.bool_]
 Columns = Mapping[str, NDArray[Any]]
-_PRECISION: Final = int(GraspType.PRECISION)
-#: For each value of a facet: words, fields of the query, and the test of the columns.
-_Values = Sequence[tuple[str, dict[str, str], Callable[[Columns], Mask]]]
-
-
-def columns_of(rows: Sequence[Sequence[Any]]) -> Columns:
-    """Return rows of `COLUMNS` as arrays; numbers are nan, words empty, where the index has none."""
-    parts = list(zip(*rows, strict=True)) or [()] * len(COLUMNS)
-    return {
-        name: np.array([one or "" for one in part], str) if name in _WORDS else np.array(part, float)
-        for name, part in zip(COLUMNS, parts, strict=True)
-    }
-
-
-def _equal(column: str, field: str, values: Mapping[str, Any]) -> _Values:
-    return [(words, {field: word}, lambda c, v=value: c[column] == v) for word, (words, value) in values.items()]  # type: ignore[misc]
-
-
-def _kinds() -> dict[str, tuple[str, _Values]]:
-    """Return title and values of each facet with fixed values."""
-    yes = {"true": 1, "false": 0}
-    return {
-        "verdict": (
-            "Verdict",
-            [
-                ("valid", {"valid": "true"}, lambda c: c["valid"] == 1),
-                ("rejected", {"valid": "false"}, lambda c: (c["valid"] == 0) & np.isfinite(c["success"])),
-                ("not judged", {"validated": "false"}, lambda c: np.isnan(c["success"])),
-            ],
-        ),
-        "type": (
-            "Type",
-            [
-                ("power: palm or whole fingers", {"type": "power"}, lambda c: c["grasp_type"] == int(GraspType.POWER)),
-                ("precision: fingertips", {"type": "precision"}, lambda c: c["grasp_type"] == _PRECISION),
-                ("pinch: thumb and one fingertip", {"type": "pinch"}, is_pinch),
-                ("lateral: sides of fingers", {"type": "lateral"}, lambda c: c["grasp_type"] == int(GraspType.LATERAL)),
-            ],
-        ),
-        "scene": (
-            "Scene",
-            [
-                ("any scene", {"scene": "any"}, lambda c: c["scene_kind"] != "free"),
-                *_equal("scene_kind", "scene", {"free": ("none: free object", "free")}),
-                *_equal("scene_kind", "scene", {kind: (kind, kind) for kind in ("table", "bin", "shelf")}),
-                *_equal("scene_kind", "scene", {"file": ("from a file", "file")}),
-            ],
-        ),
-        "neighbours": (
-            "Neighbours",
-            [
-                ("some", {"neighbours": "true"}, lambda c: c["neighbours"] > 0),
-                ("none", {"neighbours": "false"}, lambda c: c["neighbours"] == 0),
-            ],
-        ),
-        "lift_hard": (
-            "Lift at half friction",
-            _equal("lift_hard", "lift_hard", dict(zip(yes, (("lifted", 1), ("not lifted", 0)), strict=True))),
-        ),
-        "robust_weakest": (
-            "First failure",
-            _equal(
-                "robust_weakest",
-                "robust_weakest",
-                {axis.word: (words, axis.word) for axis, words in AXIS_MEANINGS.items()},
-            ),
-        ),
-    }
-
-
-def is_pinch(columns: Columns) -> Mask:
-    return (columns["grasp_type"] == _PRECISION) & np.isin(columns["digits"], PINCH)
 
 
 @dataclass(frozen=True)
 class FacetValue:
     words: str
-    fields: dict[str, str | None]
-    """Changes of the query by a click: the value's own fields, or None for each to remove a chosen value."""
+    change: dict[str, str | None]
+    """Fields of the query after a click: those of the value, or None for each if it is chosen already."""
     count: int
     chosen: bool
 
@@ -132,80 +80,87 @@ class Facets:
     metrics: list[MetricFacet]
 
 
+def columns_of(rows: Sequence[Sequence[Any]]) -> Columns:
+    """Return rows of `COLUMNS` as arrays; missing numbers are nan, missing words empty."""
+    parts = list(zip(*rows, strict=True)) or [()] * len(COLUMNS)
+    return {
+        name: np.array([one or "" for one in part], str) if name in _WORDS else np.array(part, float)
+        for name, part in zip(COLUMNS, parts, strict=True)
+    }
+
+
 def count_facets(query: GraspQuery, columns: Columns, share: float, pairs: tuple[Columns, float]) -> Facets:
     """Count a sample of the grasps that pass all filters without facets.
 
     Args:
-        columns: the sample; with hand and object of the query if it is smaller than the list.
+        columns: the sample; if it is a part of the list, only with the query's hand and object.
         share: share of the grasps in the sample.
         pairs: the same for all hands and objects."""
-    given = {name: str(value).lower() for name, value in query if value is not None and not isinstance(value, float)}
-    kinds = _kinds()
+    given = {name: str(value).lower() for name, value in query if value is not None}
     found = []
     for name in ("object", "hand"):
-        words = sorted({*np.unique(pairs[0][name]).tolist(), *filter(None, [getattr(query, name)])})
-        values = _equal(name, name, {word: (word, word) for word in words})
-        own, scale = pairs
-        found.append(_facet(name.capitalize(), values, query, given, own, _masks(query, own, kinds), name, scale))
-    masks = _masks(query, columns, kinds)
-    for name, (title, values) in kinds.items():
-        found.append(_facet(title, values, query, given, columns, masks, name, share))
-    inside = [one for metric in METRICS if (one := _metric_facet(metric, query, columns, masks)) is not None]
-    every = int(np.logical_and.reduce(list(masks.values())).sum())
-    return Facets(round(every / share), share < 1, [one for one in found if one is not None], inside)
+        words = {*pairs[0][name].tolist(), *filter(None, [getattr(query, name)])}
+        values = [(word, {name: word}) for word in sorted(words)]
+        found.append(_facet(name.capitalize(), values, given | _named(query), *pairs))
+    given |= _named(query)
+    found += [_facet(title, values, given, columns, share) for title, values in _FACETS.items()]
+    metrics = [_metric_facet(metric, given, columns) for metric in _METRICS]
+    every = round(int(_others(given, columns, ()).sum()) / share)
+    return Facets(every, share < 1, [one for one in found if one], [one for one in metrics if one])
 
 
-def _masks(query: GraspQuery, columns: Columns, kinds: Mapping[str, tuple[str, _Values]]) -> dict[str, Mask]:
-    """Return the test of each facet's filter on the columns."""
-    everything = np.ones(len(columns["hand"]), bool)
-    masks = {name: columns[name] == word for name in ("hand", "object") if (word := getattr(query, name))}
-    given = {name: str(value).lower() for name, value in query if value is not None}
-    for name, (_, values) in kinds.items():
-        for _, fields, test in values:
-            if fields.items() <= given.items():
-                masks[name] = masks.get(name, everything) & test(columns)
-    for flag, column in (("validated", np.isfinite(columns["success"])), ("success", columns["success"] == 1)):
-        if (wanted := getattr(query, flag)) is not None:
-            masks[flag if flag == "success" else "verdict"] = column == wanted
-    for metric in METRICS:
-        for end, compare in (("min", np.greater_equal), ("max", np.less_equal)):
-            if (bound := getattr(query, f"{end}_{metric.name}")) is not None:
-                masks[metric.name] = masks.get(metric.name, everything) & compare(columns[metric.name], bound)
-    return masks | {"": everything}
+def _named(query: GraspQuery) -> dict[str, str]:
+    """Return names, whose case has a meaning."""
+    return {name: value for name in ("hand", "object") if (value := getattr(query, name))}
 
 
-def _others(masks: Mapping[str, Mask], own: str) -> Mask:
-    return np.asarray(np.logical_and.reduce([mask for name, mask in masks.items() if name != own]))
+def _mask(field: str, value: str, c: Columns) -> Mask:
+    """Test the columns as the index tests them for one field of a query."""
+    end, _, metric = field.partition("_")
+    if end in ("min", "max") and metric in COLUMNS:
+        return np.asarray(c[metric] >= float(value) if end == "min" else c[metric] <= float(value))
+    if field == "type":
+        pinch = np.isin(c["digits"], PINCH) if value == "pinch" else True
+        return (c["grasp_type"] == GraspType["PRECISION" if value == "pinch" else value.upper()]) & pinch
+    if field == "scene":
+        return np.asarray(c["scene_kind"] != "free" if value == "any" else c["scene_kind"] == value)
+    if field == "neighbours":
+        return np.asarray((c["neighbours"] > 0) == _TRUTHS[value])
+    if field == "validated":
+        return np.asarray(np.isfinite(c["success"]) == _TRUTHS[value])
+    if field == "valid" and value == "false":
+        return (c["valid"] == 0) & np.isfinite(c["success"])
+    return np.asarray(c[field] == _TRUTHS.get(value, value)) if field in COLUMNS else np.ones(len(c["hand"]), bool)
+
+
+def _others(given: Mapping[str, str], columns: Columns, own: Sequence[str]) -> Mask:
+    """Test the columns for all fields except a facet's own ones."""
+    masks = [_mask(field, value, columns) for field, value in given.items() if field not in own]
+    return np.asarray(np.logical_and.reduce([np.ones(len(columns["hand"]), bool), *masks]))
 
 
 def _facet(
-    title: str,
-    values: _Values,
-    query: GraspQuery,
-    given: Mapping[str, str],
-    columns: Columns,
-    masks: Mapping[str, Mask],
-    name: str,
-    share: float,
+    title: str, values: Sequence[tuple[str, dict[str, str]]], given: Mapping[str, str], columns: Columns, share: float
 ) -> Facet | None:
-    others, found = _others(masks, name), []
-    names = {field: None for _, fields, _ in values for field in fields}
-    for words, fields, test in values:
-        count, chosen = round(int((test(columns) & others).sum()) / share), fields.items() <= given.items()
-        if count or chosen:
-            found.append(FacetValue(words, dict(names) if chosen else names | fields, count, chosen))
-    chosen_any = any(value.chosen for value in found)
-    return Facet(title, found) if len(found) > 1 or chosen_any else None
+    own: dict[str, str | None] = {field: None for _, fields in values for field in fields}
+    others, found = _others(given, columns, tuple(own)), []
+    for words, fields in values:
+        mask = others & np.logical_and.reduce([_mask(*one, columns) for one in fields.items()])
+        chosen = fields.items() <= given.items()
+        if mask.any() or chosen:
+            found.append(
+                FacetValue(words, {**own, **({} if chosen else fields)}, round(int(mask.sum()) / share), chosen)
+            )
+    # A choice of one value is none.
+    return Facet(title, found) if len(found) > 1 or any(value.chosen for value in found) else None
 
 
-def _metric_facet(
-    metric: GraspMetric, query: GraspQuery, columns: Columns, masks: Mapping[str, Mask]
-) -> MetricFacet | None:
-    values = columns[metric.name]
-    known = values[np.isfinite(values)]
-    bounds = [getattr(query, f"{end}_{metric.name}") for end in ("min", "max")]
-    if not known.size or known.min() == known.max():
-        return None if bounds == [None, None] else MetricFacet(metric, *(b or 0.0 for b in bounds), [0] * BINS)
-    low, high = float(known.min()), float(known.max())
-    counts, _ = np.histogram(values[np.isfinite(values) & _others(masks, metric.name)], BINS, (low, high))
-    return MetricFacet(metric, low, high, counts.tolist())
+def _metric_facet(metric: GraspMetric, given: Mapping[str, str], columns: Columns) -> MetricFacet | None:
+    own, values = (f"min_{metric.name}", f"max_{metric.name}"), columns[metric.name]
+    bounds = [float(given[name]) for name in own if name in given]
+    ends = [*values[np.isfinite(values)].tolist(), *bounds]
+    if not ends or (min(ends) == max(ends) and not bounds):
+        return None
+    low, high = min(ends), max(ends)
+    shown = values[_others(given, columns, own) & np.isfinite(values)]
+    return MetricFacet(metric, low, high, np.histogram(shown, BINS, (low, high))[0].tolist())

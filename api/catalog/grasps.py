@@ -7,7 +7,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import zip_longest
 from typing import Any, Final, Literal
@@ -55,15 +54,6 @@ MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(
 )
 
 
-@dataclass(frozen=True)
-class GraspMap:
-    """Grasps at positions (N, 2), and the shares (2,) of the variance that the axes show."""
-
-    grasps: list[GraspView]
-    positions: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
-    shares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
-
-
 class Grasps:
     """Grasps of the jobs in the caller's scope; they never change."""
 
@@ -108,23 +98,22 @@ class Grasps:
         kept, shards = self._with_shards(known)
         return [kept[row] for row in nearest(features(kept, shards), 0, count)]
 
-    def map(self, query: models.GraspQuery) -> GraspMap:
-        """Return the first grasps of a list on a map of their poses and contacts."""
+    def map(self, query: models.GraspQuery) -> tuple[list[GraspView], NDArray[np.float64]]:
+        """Return the first grasps of a list, and their positions (N, 2) on a map of poses and contacts."""
         kept, shards = self._with_shards(self.page(query, limit=_MAPPED).items)
-        return GraspMap(kept, *principal_components(features(kept, shards))) if kept else GraspMap([])
+        return kept, principal_components(features(kept, shards)) if kept else np.zeros((0, 2))
 
     def _with_shards(self, found: Sequence[GraspView]) -> tuple[list[GraspView], list[Shard]]:
-        """Return the grasps of the most frequent shards, first of all the first one's, and the shard of each."""
-        counts = Counter(one.shard_id for one in found)
-        some = {*(one.shard_id for one in found[:1]), *(name for name, _ in counts.most_common(_MAP_SHARDS))}
-        shards = {one.id: self._shard(one.key, one.sha256) for one in map(self._index.shards.get, some)}
+        """Return the grasps of the first one's shard and of the most frequent shards, and the shard of each."""
+        common = Counter(one.shard_id for one in found).most_common(_MAP_SHARDS)
+        shards = {name: self._index.shards.get(name) for name in {one.shard_id for one in found[:1]} | {*dict(common)}}
         kept = [one for one in found if one.shard_id in shards]
-        return kept, [shards[one.shard_id] for one in kept]
+        return kept, [self._shard(shards[one.shard_id].key, shards[one.shard_id].sha256) for one in kept]
 
     def get_short(self, name: str) -> models.GraspDetail:
         """Return the grasp of a short name: first digits of the shard id, a dot, and the row."""
         shard, _, row = name.partition(".")
-        if not (SHORT_NAME.fullmatch(name)):
+        if not SHORT_NAME.fullmatch(name):
             raise NotFoundError(f"{name[:40]!r} names no grasp; names are like 1a2b3c4d5e6f.7")
         return self.get(self._index.grasps.shard_of(shard), int(row))
 

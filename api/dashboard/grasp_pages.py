@@ -9,11 +9,11 @@ from urllib.parse import parse_qsl, quote, urlencode
 import numpy as np
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, StreamingResponse
+from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 from starlette.datastructures import FormData
 
 from graspd.api.catalog.facets import Facets
-from graspd.api.catalog.grasps import GraspMap
 from graspd.api.catalog.tags import Format, Tags
 from graspd.api.dashboard import rendering
 from graspd.api.dashboard.forms import fields_of, first_message
@@ -54,17 +54,20 @@ def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, tags: Tags
     said = action_summary(given)
     cursor, view = given.pop("cursor", None), given.pop("view", "cards")
     view = view if view in PAGE_SIZES else "cards"
-    problem, page, facets, chart, query = "", None, None, None, GraspQuery()
+    problem, page, facets, query = "", None, None, GraspQuery()
+    rows: list[GraspView] = []
+    dots: list[tuple[GraspView, list[int]]] = []
     try:
         query = GraspQuery.model_validate(given)
         facets = grasps.facets(query)
         if view == "map":
-            chart = grasps.map(query)
+            rows, places = grasps.map(query)
+            dots = list(zip(rows, _dots(places), strict=True))
         else:
             page = grasps.page(query, limit=PAGE_SIZES[view], cursor=cursor)
+            rows = page.items
     except (ValueError, InputError) as error:
         problem = first_message(error)
-    rows = page.items if page else chart.grasps if chart else []
     known, chips = tags.all(), _chips(query, facets, given)
     shown = given | ({"view": view} if view != "cards" else {})
     return render(
@@ -84,8 +87,7 @@ def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, tags: Tags
         here="/grasps",
         shown_tag=next((tag for tag in known if tag.name == query.tag), None),
         rows=rows,
-        dots=list(zip(rows, _dots(chart), strict=True)) if chart else [],
-        shares=chart.shares if chart else (),
+        dots=dots,
         models=shards.assets_of({grasp.shard_id for grasp in rows}) if view == "cards" else {},
         columns=COLUMNS,
         sort=query.sort,
@@ -105,7 +107,7 @@ def _chips(query: GraspQuery, facets: Facets | None, given: Mapping[str, str]) -
     found: list[tuple[str, dict[str, None]]] = []
     for facet in facets.values if facets else ():
         values = [value for value in facet.values if value.chosen]
-        found += [(f"{facet.title}: {one.words.partition(':')[0]}", dict.fromkeys(one.fields)) for one in values]
+        found += [(f"{facet.title}: {one.words.partition(':')[0]}", dict.fromkeys(one.change)) for one in values]
     for metric in indexed_metrics(IndexLevel.OFFERED):
         low, high = (getattr(query, f"{end}_{metric.name}") for end in ("min", "max"))
         text = " to ".join(format_metric(bound) for bound in (low, high) if bound is not None)
@@ -118,11 +120,10 @@ def _chips(query: GraspQuery, facets: Facets | None, given: Mapping[str, str]) -
     return found + [(f"{name}: {given[name][:24]}", {name: None}) for name in GraspQuery.model_fields if name in left]
 
 
-def _dots(chart: GraspMap) -> list[tuple[str, str]]:
-    """Return the positions of a map's grasps in a drawing of 960 x 560."""
-    low, size = chart.positions.min(axis=0, initial=0.0), np.ptp(chart.positions, axis=0) + 1e-9
-    placed = 16 + (chart.positions - low) / size * (928, 528)
-    return [(f"{x:.0f}", f"{y:.0f}") for x, y in placed]
+def _dots(places: NDArray[np.float64]) -> list[list[int]]:
+    """Return positions (N, 2) of a map in a drawing of 960 x 560."""
+    low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (0.0, 1.0)
+    return np.rint(16 + (places - low) / (high - low + 1e-9) * (928, 528)).astype(int).tolist()
 
 
 def _address(given: Mapping[str, str], changes: Mapping[str, str | None] | None = None, **more: str | None) -> str:

@@ -16,7 +16,7 @@ export class Forces {
   }
 
   show(point) {
-    const drawn = (point.contacts ?? []).flatMap(([x, y, z, nx, ny, nz, fx, fy, fz]) => [
+    const drawn = (point.contacts ?? []).filter((one) => one[12]).flatMap(([x, y, z, nx, ny, nz, fx, fy, fz]) => [
       ["normal", [x, y, z], [nx, ny, nz], NORMAL_M],
       ["force", [x, y, z], [fx, fy, fz], this.scale * length([fx, fy, fz])],
     ]).filter(([, , , size]) => size > LEAST_N * this.scale);
@@ -36,17 +36,17 @@ export class Forces {
   }
 
   /** Fill the table of wrenches: forces of hand and supports, weight or push, what is left; sum of contact torques. */
-  static tell(table, point, scene) {
-    table.hidden = !point.load;
-    if (!point.load) return;
-    const left = point.load.map((value, k) => value + point.hand_force[k] + point.support_force[k]);
-    const rows = { hand: point.hand_force, supports: point.support_force, [scene ? "weight" : "push"]: point.load, remaining: left };
-    if (!scene) delete rows.supports;
-    rows["torque [N mm]"] = point.torque.map((value) => 1000 * value);
+  static tell(table, { load, contacts = [] }, scene) {
+    table.hidden = !load;
+    if (!load) return;
+    const sum = (first, wanted) => [0, 1, 2].map((k) => contacts.filter(wanted).reduce((all, one) => all + one[first + k], 0));
+    const rows = { hand: sum(6, (one) => one[12]), ...(scene && { supports: sum(6, (one) => !one[12]) }), [scene ? "weight" : "push"]: load };
+    rows.remaining = sum(6, () => true).map((value, k) => value + load[k]);
+    rows["torque [N mm]"] = sum(9, () => true).map((value) => 1000 * value);
     table.tBodies[0].replaceChildren(...Object.entries(rows).map(([name, values]) => {
       const row = document.createElement("tr");
       row.append(Object.assign(document.createElement("th"), { scope: "row", textContent: name }));
-      for (const value of [...values, length(values)]) row.append(Object.assign(document.createElement("td"), { className: "num", textContent: value.toFixed(2) }));
+      for (const value of [...values, length(values)]) row.append(Object.assign(document.createElement("td"), { className: "num", textContent: (Math.round(100 * value) / 100 + 0).toFixed(2) }));
       return row;
     }));
   }
