@@ -1,6 +1,5 @@
 """Tasks of a person, with the clicks and seconds that they take; and the views of grasps."""
 
-import csv
 import time
 from pathlib import Path
 from typing import Any
@@ -87,7 +86,7 @@ def test_a_selection_is_taken_home(page: Any, services: Services) -> None:
     with page.expect_download() as download:
         person.click("button:has-text('Export')")
     person.needed(most=3)
-    assert len(list(csv.reader(Path(download.value.path()).open()))) == 3
+    assert Path(download.value.path()).read_text().count("\n") == 3
 
 
 def contact(force: float, *, hand: bool) -> list[float]:

@@ -117,7 +117,8 @@ class View {
     }
     if (this.forces) this.forces.group.visible = on;
     this.outcome = on ? this.said : null;
-    this.follow(on ? this.replayed : this.planned, Number(this.slider.value));
+    this.follow(on ? this.replayed : this.planned, this.linked ?? Number(this.slider.value));
+    this.linked = null;
   }
 
   stop() {
@@ -152,6 +153,7 @@ class View {
     };
     const [, numbers = "", at = "", names = ""] = location.hash.match(/^#view=([-\d.,]+);([\d.]+);([a-z,]*)$/) ?? [];
     const chosen = names.split(",");
+    if (chosen.includes("physics")) this.linked = Number(at); // the replay may be longer than the planned trajectory
     for (const [name, apply] of Object.entries(toggles)) {
       const box = this.find(`[data-toggle=${name}]`);
       if (!box) continue;
