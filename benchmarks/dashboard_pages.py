@@ -67,6 +67,7 @@ def pages(services: Services) -> list[str]:
     pairs = services.index.overview.matrix()[:1]
     found = ["/", "/?state=failed", "/datasets", *(f"/jobs/{job}" for job in jobs), "/grasps", "/grasps?view=table"]
     found += [f"/grasps?hand={pair.hand}&object={pair.object}&sort=penetration_depth_mm&order=asc" for pair in pairs]
+    found += [f"/grasps?object={pair.object}&valid=true&order=asc" for pair in pairs]
     found += ["/grasps?valid=true&min_epsilon=0.3&max_penetration_depth_mm=0.5", "/workers", "/chart", "/submit"]
     return found
 

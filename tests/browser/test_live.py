@@ -24,6 +24,9 @@ AXE = Path(__file__).parent / "vendor" / "axe.min.js"
 COLOURS = ["color-contrast", "link-in-text-block"]
 #: Pages that show all colours between them.
 IN_DARK = re.compile(r"/$|/datasets/kitchen$|/jobs/|/grasps$|/grasps/|/hands/|/stability|/chart|/submit|/problems")
+WIDTHS = (1440, 1024, 390)
+#: Pages whose parts are elsewhere on a narrow screen.
+OTHERWISE_LAID_OUT = re.compile(r"/grasps|/compare")
 CHART = {"created": "2026-11-21T12:00:00Z", "device": "cpu", "runs": RUNS}
 
 
@@ -47,7 +50,8 @@ def places(services: Services) -> list[str]:
     datasets = "/ /datasets /datasets/kitchen /datasets/kitchen?state=queued /compare?one=kitchen&other=kitchen"
     grasps = "/grasps /grasps?view=table /grasps?min_epsilon=99 /grasps?tag=good+ones /hands /hands/shadow"
     others = "/docs /workers /chart /stability /submit /problems /login /deleted /usage"
-    of_these = [f"/jobs/{record.id}", f"/jobs/{waiting.id}", f"/grasps/{shard}/0"]
+    side_by_side = f"/grasps/compare?g={shard[:12]}.0,{shard[:12]}.1"
+    of_these = [f"/jobs/{record.id}", f"/jobs/{waiting.id}", f"/grasps/{shard}/0", side_by_side, "/grasps?view=map"]
     return [*datasets.split(), *of_these, *grasps.split(), *others.split()]
 
 
@@ -190,12 +194,15 @@ def test_no_page_has_a_serious_accessibility_finding(page: Any, places: list[str
             page.wait_for_selector("#explorer .opblock")
         page.evaluate(AXE.read_text())
         # Colours are the same variables on all pages: some show them all.
-        dark = [("dark", f"{{ runOnly: {COLOURS} }}")] if IN_DARK.match(path) else []
-        for scheme, rules in [("light", "{}"), *dark]:
+        dark = [("dark", f"{{ runOnly: {COLOURS} }}", WIDTHS[0])] if IN_DARK.match(path) else []
+        if OTHERWISE_LAID_OUT.match(path):
+            dark += [(scheme, "{}", width) for scheme in ("light", "dark") for width in WIDTHS[1:]]
+        for scheme, rules, width in [("light", "{}", WIDTHS[0]), *dark]:
+            page.set_viewport_size({"width": width, "height": 900})
             page.emulate_media(color_scheme=scheme)
             result = page.evaluate(f"axe.run(document, {{ resultTypes: ['violations'], ...{rules} }})")
             found += [
-                f"{path}, {scheme}: {entry['id']}: {nodes[:3]}"
+                f"{path}, {scheme}, {width}: {entry['id']}: {nodes[:3]}"
                 for entry in result["violations"]
                 if entry["impact"] in ("serious", "critical") and (nodes := _nodes(entry))
             ]
