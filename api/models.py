@@ -286,7 +286,7 @@ class Worker(WorkerView):
 
 
 class Histogram(BaseModel):
-    """Distribution of one metric over the grasps of a job."""
+    """Distribution of one metric over the grasps of a job, or over a sample of about 20,000."""
 
     metric: str
     count: int

@@ -48,7 +48,7 @@ Columns = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
-class FacetValue:
+class FacetOption:
     words: str
     change: dict[str, str | None]
     """Fields of the query after a click: those of the value, or None for each if it is chosen already."""
@@ -59,7 +59,7 @@ class FacetValue:
 @dataclass(frozen=True)
 class Facet:
     title: str
-    values: list[FacetValue]
+    values: list[FacetOption]
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def _facet(
         chosen = fields.items() <= given.items()
         if mask.any() or chosen:
             found.append(
-                FacetValue(words, {**own, **({} if chosen else fields)}, round(int(mask.sum()) / share), chosen)
+                FacetOption(words, {**own, **({} if chosen else fields)}, round(int(mask.sum()) / share), chosen)
             )
     # A choice of one value is none.
     return Facet(title, found) if len(found) > 1 or any(value.chosen for value in found) else None

@@ -44,7 +44,6 @@ _MAP_SHARDS: Final = 24
 SHORT_NAME: Final = re.compile(r"[0-9a-f]{8,32}\.[0-9]{1,9}")
 #: Number of cached base shards. A shard of 32 grasps takes about 60 kB; a page needs at most one shard per row.
 _KEPT_SHARDS: Final = 64
-_BINS: Final = 20
 #: Time limit of a replay [s], which takes about 2 s of CPU time, and the limit of kept replays [bytes].
 _REPLAY_S: Final = 60.0
 _REPLAYS_BYTES: Final = 64 << 20
@@ -197,12 +196,8 @@ class Grasps:
     ) -> tuple[list[models.Histogram], models.Diversity | None]:
         """Read the statistics of a job; `count` is only part of the cache key."""
         where, known = GraspFilter(job=job_id, valid=True if validated else None), self._index.statistics
-        histograms = [
-            models.Histogram(
-                metric=metric, **vars(summary), counts=known.histogram(where, metric, summary.low, summary.high, _BINS)
-            )
-            for metric, summary in known.summaries(where, MEAN_METRICS).items()
-        ]
+        found = known.compare_distributions([where], MEAN_METRICS)
+        histograms = [models.Histogram(metric=name, **vars(one)) for name, (one,) in found.items() if one]
         return histograms, _diversity(known.kinds(where))
 
 

@@ -1,4 +1,4 @@
-"""Replay of the validation of one stored grasp: motion of hand and object, and contact forces [m, N, N m].
+"""Replay of the validation of one stored grasp: motion of hand and object, contact forces [m, N, N m].
 
 `python -m graspd.worker.stages.replay STORE SHARD ROW` writes it as JSON; the API runs it on demand. The simulation is
 that of the validator at nominal friction, in the frame of the object at rest."""
@@ -61,8 +61,7 @@ class _Recorder(Test):
         )
 
     def _contacts(self, centre: Floats) -> list[list[float]]:
-        """Return each contact of the object: position, inward normal, force on it, torque about its centre of mass, and
-        whether the hand touches."""
+        """Return position, inward normal, force, torque about `centre`, and 1 if of the hand, of each contact."""
         model, rows, wrench = self.scene.model, [], np.zeros(6)
         for number, contact in enumerate(self.data.contact):
             ours = model.geom_bodyid[contact.geom] == self.scene.object_body

@@ -43,11 +43,8 @@ export class Forces {
     const rows = { hand: sum(6, (one) => one[12]), ...(scene && { supports: sum(6, (one) => !one[12]) }), [scene ? "weight" : "push"]: load };
     rows.remaining = sum(6, () => true).map((value, k) => value + load[k]);
     rows["torque [N mm]"] = sum(9, () => true).map((value) => 1000 * value);
-    table.tBodies[0].replaceChildren(...Object.entries(rows).map(([name, values]) => {
-      const row = document.createElement("tr");
-      row.append(Object.assign(document.createElement("th"), { scope: "row", textContent: name }));
-      for (const value of [...values, length(values)]) row.append(Object.assign(document.createElement("td"), { className: "num", textContent: (Math.round(100 * value) / 100 + 0).toFixed(2) }));
-      return row;
-    }));
+    const cell = (value) => `<td class="num">${(Math.round(100 * value) / 100 + 0).toFixed(2)}</td>`;
+    const line = ([name, values]) => `<tr><th scope="row">${name}</th>${[...values, length(values)].map(cell).join("")}</tr>`;
+    table.tBodies[0].innerHTML = Object.entries(rows).map(line).join("");
   }
 }

@@ -68,7 +68,7 @@ class Grasps(database.IndexPart):
         return GraspView(**self.database.first_row(query, f"grasp {row} in shard {shard_id!r}"))
 
     def shard_of(self, prefix: str) -> str:
-        """Return the shard with grasps whose id starts with hexadecimal digits; NotFoundError if there is none."""
+        """Return the shard whose id starts with hexadecimal digits; NotFoundError if there is none."""
         query = select(grasps.c.shard_id).where(grasps.c.shard_id.between(prefix, prefix + "g")).limit(1)
         return str(self.database.first_row(query, f"shard {prefix!r}")["shard_id"])
 
