@@ -7,6 +7,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from itertools import zip_longest
 from typing import Any, Final, Literal
@@ -23,7 +24,7 @@ from graspd.service.index.queries.grasps import GraspFilter, GraspSort, Metric
 from graspd.service.index.queries.statistics import GraspKinds
 from graspd.service.index.views import GraspView, JobView, Page
 from graspd.service.model import metrics
-from graspd.service.model.errors import InputError, LimitError, NotFoundError, UnavailableError
+from graspd.service.model.errors import DamagedError, InputError, LimitError, NotFoundError, UnavailableError
 from graspd.service.model.records import MOST_TAGGED, Grasp
 from graspd.service.model.scene_spec import scene_supports
 from graspd.service.model.version import PACKAGE_VERSION
@@ -105,9 +106,14 @@ class Grasps:
     def _with_shards(self, found: Sequence[GraspView]) -> tuple[list[GraspView], list[Shard]]:
         """Return the grasps of the first one's shard and of the most frequent shards, and the shard of each."""
         common = Counter(one.shard_id for one in found).most_common(_MAP_SHARDS)
-        shards = {name: self._index.shards.get(name) for name in {one.shard_id for one in found[:1]} | {*dict(common)}}
+        shards = {}
+        for name in {one.shard_id for one in found[:1]} | {*dict(common)}:
+            # Grasps of a damaged file have no place on the map.
+            with suppress(NotFoundError, DamagedError):
+                shard = self._index.shards.get(name)
+                shards[name] = self._shard(shard.key, shard.sha256)
         kept = [one for one in found if one.shard_id in shards]
-        return kept, [self._shard(shards[one.shard_id].key, shards[one.shard_id].sha256) for one in kept]
+        return kept, [shards[one.shard_id] for one in kept]
 
     def get_short(self, name: str) -> models.GraspDetail:
         """Return the grasp of a short name: first digits of the shard id, a dot, and the row."""

@@ -172,6 +172,8 @@ def test_grasps_are_compared_at_a_short_address_and_placed_on_a_map(http: TestCl
     drawn = http.get("/grasps?view=map&type=power").text
     assert drawn.count("<circle class=") == len(http.get("/v1/grasps?type=power&limit=200").json()["items"])
     assert "No grasp matches" in http.get("/grasps?view=map&min_epsilon=99").text
+    lost = finish_all(services, add_job(services, seed=5))[0].key
+    (services.settings.data_dir / "store" / lost).unlink()
     similar = http.get(f"/grasps/{shard}/3").text
     assert similar.count('<li class="card grasp">') == 6 and f'value="{shard}:3" data-fixed' in similar
 
