@@ -81,6 +81,7 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     app.state.keys, app.state.proxy, app.state.metrics = keys, proxy, Metrics()
     install_services(app, opened)
     app.state.uploads, app.state.forms, app.state.exports = map(RequestLimiter, (UPLOADS, FORMS, EXPORTS))
+    app.state.replays = RequestLimiter(1)
     problems.install_handlers(app, problem_page)
     pages.install_dashboard(app, opened)
     for router in (*_ROUTERS, *map(asset_router, AssetKind), *datasets.routers, *pages.routers):

@@ -113,7 +113,9 @@ class GraspQuery(BaseModel):
     validated: bool | None = Field(None, description="whether the validator gave a verdict")
     valid: bool | None = Field(None, description="false: validated, but not valid")
     success: bool | None = None
-    type: Literal["power", "precision", "lateral"] | None = Field(None, description="grasp type")
+    type: Literal["power", "precision", "pinch", "lateral"] | None = Field(
+        None, description="grasp type; pinch: precision with thumb and one finger"
+    )
     scene: Literal["free", "table", "bin", "shelf", "file", "any"] | None = Field(
         None, description="kind of the scene in which it was planned; any: all kinds except free"
     )
@@ -141,6 +143,28 @@ class Waypoint(BaseModel):
     hand_pose: list[float] = Field(description="pose of the root link: x y z [m], quaternion w x y z")
     joint_positions: list[float] = Field(description="joint positions in the order of joint_names [rad or m]")
     carried: list[float] = Field(description="displacement of the object from rest: x y z [m]")
+
+
+class ReplayPoint(BaseModel):
+    """State of a replayed validation, in the frame of the object at rest [m, N, N m]."""
+
+    name: str = Field(description="named posture as in `Waypoint`, or pushes; empty between them")
+    place: float = Field(description="position on the slider of `Waypoint`; all after the squeeze takes one unit")
+    phase: str = Field(description="approach, closing, lifting, holding, or the direction of a push")
+    hand_pose: list[float]
+    joint_positions: list[float]
+    object_pose: list[float] = Field(description="pose relative to rest: x y z, quaternion w x y z")
+    contacts: list[list[float]] = Field(
+        [], description="contacts of the object: position, inward normal, force on it, torque, 1 if the hand touches"
+    )
+    load: list[float] | None = Field(None, description="weight or push at the object's centre of mass")
+
+
+class GraspReplay(BaseModel):
+    """Validation of a grasp, simulated again in MuJoCo at nominal friction."""
+
+    outcome: str
+    way: list[ReplayPoint]
 
 
 class Neighbour(BaseModel):
@@ -266,7 +290,7 @@ class Worker(WorkerView):
 
 
 class Histogram(BaseModel):
-    """Distribution of one metric over the grasps of a job."""
+    """Distribution of one metric over the grasps of a job, or over a sample of about 20,000."""
 
     metric: str
     count: int

@@ -68,6 +68,7 @@ def pages(services: Services) -> list[str]:
     found = ["/", "/jobs", "/jobs?state=failed&sort=duration", "/jobs?q=allegro+mug", "/jobs?q=none", "/search?q=mug"]
     found += ["/objects", "/hands", "/datasets", *(f"/jobs/{job}" for job in jobs), "/grasps", "/grasps?view=table"]
     found += [f"/grasps?hand={pair.hand}&object={pair.object}&sort=penetration_depth_mm&order=asc" for pair in pairs]
+    found += [f"/grasps?object={pair.object}&valid=true&order=asc" for pair in pairs]
     found += ["/grasps?valid=true&min_epsilon=0.3&max_penetration_depth_mm=0.5", "/workers", "/chart", "/submit"]
     return found
 

@@ -1,20 +1,33 @@
 """Grasps: search by metrics, distributions of a job, and details of one grasp from its base shard."""
 
 import math
+import re
+import subprocess
+import sys
+import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from itertools import zip_longest
 from typing import Any, Final, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from graspd.api import models
 from graspd.api.access.auth import project_scope
+from graspd.api.catalog.facets import COLUMNS, PINCH, SAMPLE, Columns, Facets, columns_of, count_facets
+from graspd.api.catalog.grasp_map import features, nearest, principal_components
+from graspd.service import user_cache
 from graspd.service.index.queries.grasps import GraspFilter, GraspSort, Metric
 from graspd.service.index.queries.statistics import GraspKinds
 from graspd.service.index.views import GraspView, JobView, Page
 from graspd.service.model import metrics
-from graspd.service.model.errors import InputError, LimitError, NotFoundError
+from graspd.service.model.errors import DamagedError, InputError, LimitError, NotFoundError, UnavailableError
 from graspd.service.model.records import MOST_TAGGED, Grasp
 from graspd.service.model.scene_spec import scene_supports
+from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.pipeline.backends import Services
 from graspd.service.readers.trajectories import planned_scene_of, slider_positions, trajectory_of
 from graspd.service.store.columns import LIFT_OUTCOMES, PUSH_OUTCOMES
@@ -22,9 +35,19 @@ from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import Shard, read_shard
 
 _KEPT_STATISTICS: Final = 256
+#: Number of cached samples for facets, of about 1 MB each, and the time after which they are read again [s].
+_KEPT_SAMPLES: Final = 16
+_SAMPLE_S: Final = 20.0
+#: Largest numbers of grasps on a map, and of their shards: reading one takes milliseconds.
+_MAPPED: Final = 200
+_MAP_SHARDS: Final = 24
+#: Short name of a grasp in addresses.
+SHORT_NAME: Final = re.compile(r"[0-9a-f]{8,32}\.[0-9]{1,9}")
 #: Number of cached base shards. A shard of 32 grasps takes about 60 kB; a page needs at most one shard per row.
 _KEPT_SHARDS: Final = 64
-_BINS: Final = 20
+#: Time limit of a replay [s], which takes about 2 s of CPU time, and the limit of kept replays [bytes].
+_REPLAY_S: Final = 60.0
+_REPLAYS_BYTES: Final = 64 << 20
 _SHARED: Final = GraspFilter.model_fields.keys() & models.GraspQuery.model_fields.keys()
 MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(
     metric.name for metric in metrics.indexed_metrics(metrics.IndexLevel.OFFERED)
@@ -38,6 +61,7 @@ class Grasps:
         self._index = services.index
         self._store = services.store
         self._shard = lru_cache(maxsize=_KEPT_SHARDS)(self._read_shard)
+        self._sample = lru_cache(maxsize=_KEPT_SAMPLES)(self._read_sample)
         self._statistics = lru_cache(maxsize=_KEPT_STATISTICS)(self._read_statistics)
 
     def page(self, query: models.GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
@@ -51,6 +75,53 @@ class Grasps:
             raise LimitError(f"more than {MOST_TAGGED} grasps pass this filter, the maximum of a selection; narrow it")
         return found
 
+    def facets(self, query: models.GraspQuery) -> Facets:
+        """Return counts of facets and distributions of metrics under the filters of a list."""
+        plain = models.GraspQuery(job=query.job, dataset=query.dataset, tag=query.tag, where=query.where)
+        now = time.monotonic() // _SAMPLE_S
+        pairs = self._sample(self._filter(plain).model_dump_json(), now)
+        shown = pairs
+        if pairs[1] < 1 and (query.hand or query.object):
+            of_pair = plain.model_copy(update={"hand": query.hand, "object": query.object})
+            shown = self._sample(self._filter(of_pair).model_dump_json(), now)
+        return count_facets(query, *shown, pairs)
+
+    def _read_sample(self, where: str, now: float) -> tuple[Columns, float]:
+        """Read a sample for facets; `where` is a filter as JSON, and `now` limits the time in the cache."""
+        rows, share = self._index.statistics.sample(GraspFilter.model_validate_json(where), COLUMNS, SAMPLE)
+        return columns_of(rows), share
+
+    def similar(self, grasp: GraspView, count: int) -> list[GraspView]:
+        """Return grasps of the same hand and object with the most similar pose and contacts."""
+        found = self.page(models.GraspQuery(hand=grasp.hand, object=grasp.object), limit=_MAPPED).items
+        known = [grasp, *(one for one in found if (one.shard_id, one.row) != (grasp.shard_id, grasp.row))]
+        kept, shards = self._with_shards(known)
+        return [kept[row] for row in nearest(features(kept, shards), 0, count)]
+
+    def map(self, query: models.GraspQuery) -> tuple[list[GraspView], NDArray[np.float64]]:
+        """Return the first grasps of a list, and their positions (N, 2) on a map of poses and contacts."""
+        kept, shards = self._with_shards(self.page(query, limit=_MAPPED).items)
+        return kept, principal_components(features(kept, shards)) if kept else np.zeros((0, 2))
+
+    def _with_shards(self, found: Sequence[GraspView]) -> tuple[list[GraspView], list[Shard]]:
+        """Return the grasps of the first one's shard and of the most frequent shards, and the shard of each."""
+        common = Counter(one.shard_id for one in found).most_common(_MAP_SHARDS)
+        shards = {}
+        for name in {one.shard_id for one in found[:1]} | {*dict(common)}:
+            # Grasps of a damaged file have no place on the map.
+            with suppress(NotFoundError, DamagedError):
+                shard = self._index.shards.get(name)
+                shards[name] = self._shard(shard.key, shard.sha256)
+        kept = [one for one in found if one.shard_id in shards]
+        return kept, [shards[one.shard_id] for one in kept]
+
+    def get_short(self, name: str) -> models.GraspDetail:
+        """Return the grasp of a short name: first digits of the shard id, a dot, and the row."""
+        shard, _, row = name.partition(".")
+        if not SHORT_NAME.fullmatch(name):
+            raise NotFoundError(f"{name[:40]!r} names no grasp; names are like 1a2b3c4d5e6f.7")
+        return self.get(self._index.grasps.shard_of(shard), int(row))
+
     def get_many(self, places: Sequence[Grasp]) -> Iterator[GraspView]:
         """Yield grasps by identifier, without deleted ones; the caller must have access to all of them."""
         return self._index.grasps.get_many(places)
@@ -62,6 +133,7 @@ class Grasps:
         found = query.model_dump(include=_SHARED) | {
             "project": None if seen.everything else seen.project,
             "tag": query.tag and self._index.tags.id_of(query.tag, scope=seen),
+            "digits": PINCH if query.type == "pinch" else (),
             "at_least": _metric_bounds(query, "min"),
             "at_most": _metric_bounds(query, "max"),
         }
@@ -99,6 +171,26 @@ class Grasps:
         except InputError as error:
             raise NotFoundError(f"{key} holds no grasps that can be shown: {error}") from None
 
+    def replay(self, shard_id: str, row: int) -> bytes:
+        """Return the JSON of a `GraspReplay`, simulated by a child process or kept from an earlier call.
+        Raises UnavailableError: this machine lacks the engine, or the simulation failed or took too long."""
+        self._index.grasps.get(shard_id, row, scope=project_scope())
+        kept = user_cache.cache_folder("replays") / f"{shard_id}-{row}-{PACKAGE_VERSION}.json"
+        if (known := user_cache.load(kept)) is not None:
+            return known
+        command = [sys.executable, "-m", "graspd.worker.stages.replay", self._store.url, shard_id, str(row)]
+        try:
+            found = subprocess.run(
+                command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_REPLAY_S, check=True
+            )
+        except subprocess.CalledProcessError as error:
+            why = error.stderr.decode(errors="replace").strip().splitlines()[-1:] or [str(error)]
+            raise UnavailableError(f"the API's machine cannot simulate this grasp: {why[0][:300]}") from None
+        except subprocess.TimeoutExpired:
+            raise UnavailableError(f"the simulation takes longer than {_REPLAY_S:.0f} s; try again later") from None
+        user_cache.store(kept, found.stdout, limit_bytes=_REPLAYS_BYTES)
+        return found.stdout
+
     def statistics(self, job: JobView | models.JobDetail) -> tuple[list[models.Histogram], models.Diversity | None]:
         """Return distributions and diversity of a job's valid grasps; without validation, of all stored ones."""
         validated = job.request.validation != "none"
@@ -110,12 +202,8 @@ class Grasps:
     ) -> tuple[list[models.Histogram], models.Diversity | None]:
         """Read the statistics of a job; `count` is only part of the cache key."""
         where, known = GraspFilter(job=job_id, valid=True if validated else None), self._index.statistics
-        histograms = [
-            models.Histogram(
-                metric=metric, **vars(summary), counts=known.histogram(where, metric, summary.low, summary.high, _BINS)
-            )
-            for metric, summary in known.summaries(where, MEAN_METRICS).items()
-        ]
+        found = known.compare_distributions([where], MEAN_METRICS)
+        histograms = [models.Histogram(metric=name, **vars(one)) for name, (one,) in found.items() if one]
         return histograms, _diversity(known.kinds(where))
 
 
@@ -135,7 +223,10 @@ def _diversity(kinds: GraspKinds) -> models.Diversity | None:
 def _metric_bounds(query: models.GraspQuery, end: Literal["min", "max"]) -> dict[Metric, float]:
     values = {metric: getattr(query, f"{end}_{metric}", None) for metric in MEAN_METRICS}
     found = {metric: value for metric, value in values.items() if value is not None}
-    return found if query.type is None else {"grasp_type": float(metrics.GraspType[query.type.upper()])} | found
+    if query.type is None:
+        return found
+    kind = metrics.GraspType.PRECISION if query.type == "pinch" else metrics.GraspType[query.type.upper()]
+    return {"grasp_type": float(kind)} | found
 
 
 _POSTURES: Final = ("pregrasp", "grasp", "squeeze")

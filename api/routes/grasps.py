@@ -12,13 +12,21 @@ from graspd.api.routes.dependencies import READ, SUBMIT, ExportsOf, GraspsOf, Pa
 from graspd.service.index.views import GraspView, Page, TagView
 
 router = APIRouter(prefix="/v1/grasps", tags=["grasps"])
+_KEPT = {"Cache-Control": "private, max-age=86400"}
 
 
 @router.get("/{shard_id}/{row}", dependencies=READ, responses=problem_responses(404))
 def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> models.GraspDetail:
     """Return one grasp with its postures, and its metrics at every contact threshold."""
-    response.headers["Cache-Control"] = "private, max-age=86400"
+    response.headers.update(_KEPT)
     return grasps.get(shard_id, row)
+
+
+@router.get("/{shard_id}/{row}/replay", dependencies=READ, responses=problem_responses(404, 503))
+async def replay_grasp(request: Request, shard_id: str, row: int, grasps: GraspsOf) -> models.GraspReplay:
+    """Simulate the validation of one grasp again; the API's machine needs the engine (`graspd[worker]`)."""
+    found = await request.app.state.replays.run(grasps.replay, shard_id, row)
+    return Response(found, media_type="application/json", headers=_KEPT)  # type: ignore[return-value]
 
 
 @router.get(

@@ -150,6 +150,10 @@ def _base(random: np.random.Generator, count: int, request: JobRequest) -> Array
     kinds = np.random.default_rng(count)
     arrays["quality/grasp_type"] = kinds.integers(1, 4, count).astype(np.int32)
     arrays["quality/approach_cell"] = kinds.integers(0, 48, count).astype(np.int32)
+    more = np.random.default_rng(count + 1)
+    arrays["quality/digits"] = more.choice([3, 5, 7, 15], count).astype(np.int32)
+    if request.payload:
+        arrays["quality/payload_kg"] = more.uniform(0.1, 1.2, count)
     arrays["quality/valid"] = (random.random(count) < 0.8).astype(np.uint8)
     if request.validation == "none":
         return arrays | {"quality/feasible": np.ones(count, np.uint8), "quality/valid": np.zeros(count, np.uint8)}

@@ -88,7 +88,9 @@ def watched(chromium: Any, address: str) -> Iterator[Any]:
     watch = Watch(address)
     context = chromium.new_context(base_url=address, viewport={"width": 1440, "height": 900}, accept_downloads=True)
     context.set_default_timeout(SHOWN_MS)
-    yield watch(context.new_page())
+    page = watch(context.new_page())
+    page.watch = watch
+    yield page
     context.close()
     assert watch.trouble == []
 

@@ -31,7 +31,7 @@ IN_DARK = re.compile(
     r"/$|/datasets/kitchen$|/jobs|/objects|/search|/hands|/grasps$|/grasps/|/hands/|/stability|/chart|/submit|/problems|/engine|/notifications"
 )
 #: Pages that are looked at by axe at all widths, too.
-NARROW = re.compile(r"/$|/jobs|/objects|/hands|/search")
+NARROW = re.compile(r"/$|/jobs|/objects|/hands|/search|/grasps|/compare")
 WHY = {
     "outcomes": {"slipped": 70, "penetration": 12},
     "planner_seconds": 9.0,
@@ -65,8 +65,15 @@ def places(services: Services) -> list[str]:
     others = (
         "/docs /workers /chart /stability /submit /submit?density=400 /notifications /problems /login /deleted /usage"
     )
+    side_by_side = f"/grasps/compare?g={shard[:12]}.0,{shard[:12]}.1"
     tasks = [f"/jobs/{job.id}/tasks/{next(plan_tasks(job)).id}" for job in (few, failed, waiting)]
-    of_these = [*(f"/jobs/{job.id}" for job in (record, few, failed, waiting)), *tasks, f"/grasps/{shard}/0"]
+    of_these = [
+        *(f"/jobs/{job.id}" for job in (record, few, failed, waiting)),
+        *tasks,
+        f"/grasps/{shard}/0",
+        side_by_side,
+        "/grasps?view=map",
+    ]
     return [*datasets.split(), *of_these, *finding.split(), *grasps.split(), *others.split()]
 
 
@@ -115,9 +122,9 @@ def test_a_filter_takes_effect_at_once_and_stands_in_the_address(page: Any, serv
     finish_all(services, add_job(services, grasps=96))
     page.goto("/grasps?view=table")
     page.evaluate("window.stayed = true")
-    page.select_option("#valid", "false")
+    page.click("#facets a:has-text('rejected')")
     page.wait_for_selector("#found .badge:has-text('rejected')")
-    page.wait_for_url("**/grasps?valid=false&view=table")
+    page.wait_for_url("**/grasps?view=table&valid=false")
     until(lambda: page.locator("#found .badge:has-text('valid')").count() == 0, "the others are gone")
     assert page.evaluate("window.stayed") is True
 
@@ -303,7 +310,7 @@ def test_grasps_are_chosen_tagged_found_and_exported_by_keyboard(page: Any, serv
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     page.wait_for_selector("text=2 grasps tagged good.")
-    page.select_option("#tag", "good")
+    page.click("#facets a:has-text('good')")
     page.wait_for_url("**tag=good**")
     page.wait_for_selector("#found .tag-head")
     assert boxes.count() == 2

@@ -22,7 +22,7 @@ from graspd.service.store.columns import Attribute
 from graspd.service.store.hand_files import format_of
 from graspd.service.store.integrity import get_document, get_sealed, put_document, put_sealed
 from graspd.service.store.library import load_asset_files
-from graspd.service.store.manifests import load_shard
+from graspd.service.store.manifests import ShardManifest, load_shard
 from graspd.service.store.network_file import ProposalNetwork, from_bytes, network_bytes
 from graspd.service.store.shards import Shard
 from graspd.service.store.store import Store
@@ -46,7 +46,7 @@ _cache: LRUCache[Hashable, object] = LRUCache(16)
 _lock = threading.RLock()
 
 
-def hand_of(store: Store, message: TaskMessage) -> HandModel:
+def hand_of(store: Store, message: TaskMessage | ShardManifest) -> HandModel:
     name, digest = message.request.hand, message.hand_digest
 
     def load() -> HandModel:
@@ -57,7 +57,7 @@ def hand_of(store: Store, message: TaskMessage) -> HandModel:
     return _cached((store.url, AssetKind.HAND, name, digest), load)
 
 
-def object_of(store: Store, message: TaskMessage) -> ObjectModel:
+def object_of(store: Store, message: TaskMessage | ShardManifest) -> ObjectModel:
     """Load the object of a task, simplified within the tolerance of its fidelity."""
     request, digest = message.request, message.object_digest
     name, error = request.object, request.resolved_fidelity.face_error_m
@@ -78,7 +78,7 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
     return _cached((store.url, AssetKind.OBJECT, name, digest, *terms), load)
 
 
-def neighbours_of(store: Store, message: TaskMessage) -> list[ObjectModel]:
+def neighbours_of(store: Store, message: TaskMessage | ShardManifest) -> list[ObjectModel]:
     """Load the other objects in the scenes of a task, in the order of its request."""
 
     def load(name: str, digest: str) -> ObjectModel:

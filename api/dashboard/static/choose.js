@@ -2,7 +2,7 @@
 // a bar shows how many are selected. `data-choose` of a form is the name of its boxes.
 (() => {
   "use strict";
-  const boxes = (form) => [...form.querySelectorAll(`input[name="${form.dataset.choose}"]`)];
+  const boxes = (form) => [...form.querySelectorAll(`input[name="${form.dataset.choose}"][type=checkbox]`)];
   const forms = () => document.querySelectorAll("form[data-choose]");
 
   function tell(form) {
@@ -10,14 +10,25 @@
     const all = form.querySelector("input[name=all]"), every = form.querySelector("input[data-every]");
     const said = all?.checked ? all.dataset.said : count ? `${count} ${what}${count === 1 ? "" : "s"} selected` : `Select ${what}s`;
     form.querySelector("[data-chosen]").textContent = said;
-    for (const button of form.querySelectorAll("button[data-acts]")) button.disabled = count === 0 && !all?.checked;
+    for (const button of form.querySelectorAll("button[data-acts]")) {
+      const [least, most] = (button.dataset.few ?? "1-Infinity").split("-").map(Number);
+      button.disabled = button.dataset.few ? count < least || count > most : count === 0 && !all?.checked;
+    }
     if (every) {
       every.checked = count > 0 && count === boxes(form).length;
       every.indeterminate = count > 0 && !every.checked;
     }
   }
 
+  // Sliders over a histogram write their values into the fields of the form; an end of the range is no filter.
+  document.addEventListener("input", (event) => {
+    const slider = event.target;
+    if (!slider.matches("[data-range] input[type=range]")) return;
+    const place = slider.dataset.end === "min" ? 0 : 1, field = slider.closest("fieldset").querySelectorAll("input[name]")[place];
+    field.value = slider.value === (place ? slider.max : slider.min) ? "" : Number(Number(slider.value).toPrecision(3));
+  });
   document.addEventListener("change", (event) => {
+    if (event.target.matches("[data-range] input, .sorting select")) document.getElementById("filters").requestSubmit();
     const form = event.target.closest("form[data-choose]");
     if (!form) return;
     if (event.target.matches("input[data-every]")) boxes(form).forEach((box) => { box.checked = event.target.checked; });

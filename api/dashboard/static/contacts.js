@@ -100,7 +100,7 @@ function colourOf(distance, out) {
   return out.set(STOPS[last][1]);
 }
 
-/** Dots on the hand near the object, in the object's frame; hidden dots shine through faintly. */
+/** Dots on the hand near the object, in the object's frame. */
 export class Contacts {
   constructor(hand, thing) {
     this.hand = hand;
@@ -110,16 +110,12 @@ export class Contacts {
     let count = 0;
     hand.eachPoint(this.frame, () => { count += 1; });
     const dot = new SphereGeometry(DOT_M, 8, 6);
-    this.front = new InstancedMesh(dot, new MeshBasicMaterial(), count);
-    this.behind = new InstancedMesh(dot, new MeshBasicMaterial({ transparent: true, opacity: 0.5, depthTest: false }), count);
+    this.dots = new InstancedMesh(dot, new MeshBasicMaterial(), count);
+    this.dots.instanceMatrix.setUsage(DynamicDrawUsage);
+    this.dots.frustumCulled = false;
     this.group = new Group();
     this.group.position.copy(thing.mesh.position);
-    for (const mesh of [this.behind, this.front]) {
-      mesh.instanceMatrix.setUsage(DynamicDrawUsage);
-      mesh.frustumCulled = false;
-      mesh.renderOrder = 2;
-      this.group.add(mesh);
-    }
+    this.group.add(this.dots);
   }
 
   /** Place the dots for the hand's present posture; return the number within 1 mm and the lowest distance [m]. */
@@ -134,17 +130,13 @@ export class Contacts {
       touching += distance < 0.001;
       place.makeTranslation(point.x, point.y, point.z);
       colourOf(distance, colour);
-      for (const mesh of [this.front, this.behind]) {
-        mesh.setMatrixAt(shown, place);
-        mesh.setColorAt(shown, colour);
-      }
+      this.dots.setMatrixAt(shown, place);
+      this.dots.setColorAt(shown, colour);
       shown += 1;
     });
-    for (const mesh of [this.front, this.behind]) {
-      mesh.count = shown;
-      mesh.instanceMatrix.needsUpdate = true;
-      if (mesh.instanceColor) mesh.instanceColor.needsUpdate = true;
-    }
+    this.dots.count = shown;
+    this.dots.instanceMatrix.needsUpdate = true;
+    if (this.dots.instanceColor) this.dots.instanceColor.needsUpdate = true;
     return { touching, lowest };
   }
 }

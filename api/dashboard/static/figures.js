@@ -120,13 +120,18 @@ export class Thing {
   }
 }
 
-/** Interpolate two postures, 0 to 1: linear for positions and joints, slerp for the rotation. */
-export function between(first, second, share, names) {
-  const mix = (a, b) => a + (b - a) * share;
-  const [ax, ay, az, aw, ai, aj, ak] = first.hand_pose;
-  const [bx, by, bz, bw, bi, bj, bk] = second.hand_pose;
+/** Interpolate two poses, 0 to 1: linear for the position, slerp for the rotation. */
+export function mixPoses([ax, ay, az, aw, ai, aj, ak], [bx, by, bz, bw, bi, bj, bk], share) {
   const turn = new Quaternion(ai, aj, ak, aw).slerp(new Quaternion(bi, bj, bk, bw), share);
+  return [ax + (bx - ax) * share, ay + (by - ay) * share, az + (bz - az) * share, turn.w, turn.x, turn.y, turn.z];
+}
+
+/** Interpolate two postures, 0 to 1. */
+export function between(first, second, share, names) {
   const positions = {};
-  names.forEach((name, i) => { positions[name] = mix(first.joint_positions[i], second.joint_positions[i]); });
-  return { pose: [mix(ax, bx), mix(ay, by), mix(az, bz), turn.w, turn.x, turn.y, turn.z], positions };
+  names.forEach((name, i) => {
+    const [a, b] = [first.joint_positions[i], second.joint_positions[i]];
+    positions[name] = a + (b - a) * share;
+  });
+  return { pose: mixPoses(first.hand_pose, second.hand_pose, share), positions };
 }

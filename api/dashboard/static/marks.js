@@ -1,36 +1,17 @@
 // Findings of a hand's check, drawn on the hand: palm frame, approach, closing directions, and pads of the fingertips.
-import { BufferAttribute, BufferGeometry, Group, InstancedMesh, Matrix4, Mesh, MeshBasicMaterial, MeshStandardMaterial, SphereGeometry, Vector3 } from "./vendor/three.min.js";
+import { Group, InstancedMesh, LatheGeometry, Matrix4, Mesh, MeshBasicMaterial, MeshStandardMaterial, SphereGeometry, Vector2, Vector3 } from "./vendor/three.min.js";
 
-const COLOURS = { approach: 0xdd7432, closing: 0x1f9c93, pad: 0xd6409f, axes: [0xc8343c, 0x3c9a4a, 0x3566c8] };
+const COLOURS = { approach: 0xdd7432, closing: 0x1f9c93, pad: 0xd6409f };
+export const AXES = [0xc8343c, 0x3c9a4a, 0x3566c8];
 const SIDES = 20;
 const Z = new Vector3(0, 0, 1);
 
 /** Unit arrow along z: profile of radius and height, rotated about the axis. */
-function arrowGeometry() {
-  const profile = [[0, 0], [0.03, 0], [0.03, 0.72], [0.09, 0.72], [0, 1]];
-  const position = [], index = [];
-  for (let p = 0; p + 1 < profile.length; p++) {
-    for (let i = 0; i < SIDES; i++) {
-      const corner = (k, j) => {
-        const [radius, height] = profile[p + k], angle = (2 * Math.PI * (i + j)) / SIDES;
-        return [radius * Math.cos(angle), radius * Math.sin(angle), height];
-      };
-      const first = position.length / 3;
-      position.push(...corner(0, 0), ...corner(0, 1), ...corner(1, 1), ...corner(1, 0));
-      index.push(first, first + 1, first + 2, first, first + 2, first + 3);
-    }
-  }
-  const made = new BufferGeometry();
-  made.setAttribute("position", new BufferAttribute(new Float32Array(position), 3));
-  made.setIndex(new BufferAttribute(new Uint16Array(index), 1));
-  made.computeVertexNormals();
-  return made;
-}
-
-const ARROW = arrowGeometry();
+const PROFILE = [[0, 0], [0.03, 0], [0.03, 0.72], [0.09, 0.72], [0, 1]].map(([radius, height]) => new Vector2(radius, height));
+const ARROW = new LatheGeometry(PROFILE, SIDES).rotateX(Math.PI / 2);
 
 /** Arrow that shines faintly through objects in front of it. */
-class Arrow {
+export class Arrow {
   constructor(color) {
     this.group = new Group();
     const faint = new Mesh(ARROW, new MeshBasicMaterial({ color, transparent: true, opacity: 0.3, depthTest: false }));
@@ -65,7 +46,7 @@ export class Marks {
     this.size = size;
     this.group = new Group();
     this.approach = new Arrow(COLOURS.approach);
-    this.axes = COLOURS.axes.map((color) => new Arrow(color));
+    this.axes = AXES.map((color) => new Arrow(color));
     this.closing = new Map();
     this.group.add(this.approach.group, ...this.axes.map((axis) => axis.group));
     this.pads = hand.extras.pads.map(({ body, points }) => {

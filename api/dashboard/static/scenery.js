@@ -1,5 +1,5 @@
 // Surroundings of an object: tables, walls, boards, other objects; viewpoints with a free view of the object.
-import { BufferAttribute, BufferGeometry, Group, Mesh, MeshStandardMaterial, Quaternion, Vector3 } from "./vendor/three.min.js";
+import { BoxGeometry, CircleGeometry, Group, Mesh, MeshStandardMaterial, Quaternion, Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { Thing } from "./figures.js";
 
@@ -12,53 +12,21 @@ const STEP = Math.PI / 8;
 const HEIGHTS = [0.45, 0.8, 1.15];
 const FAR_M = 0.6;
 
-function mesh(position, normal, index, look) {
-  const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new BufferAttribute(new Float32Array(position), 3));
-  geometry.setAttribute("normal", new BufferAttribute(new Float32Array(normal), 3));
-  geometry.setIndex(new BufferAttribute(new Uint16Array(index), 1));
-  const made = new Mesh(geometry, look);
-  made.receiveShadow = true;
-  return made;
-}
-
 /** Plane of a half-space as a disc below `middle`, invisible from below. */
 function disc({ normal, offset }, middle) {
-  const position = [0, 0, 0], normals = [0, 0, 1], index = [];
-  for (let i = 0; i < CORNERS; i++) {
-    const angle = (2 * Math.PI * i) / CORNERS;
-    position.push(DISC_M * Math.cos(angle), DISC_M * Math.sin(angle), 0);
-    normals.push(0, 0, 1);
-    index.push(0, 1 + i, 1 + ((i + 1) % CORNERS));
-  }
-  const made = mesh(position, normals, index, new MeshStandardMaterial({ color: COLOURS.support, roughness: 0.9 }));
+  const made = new Mesh(new CircleGeometry(DISC_M, CORNERS), new MeshStandardMaterial({ color: COLOURS.support, roughness: 0.9 }));
   const up = new Vector3(...normal), length = up.length();
   up.divideScalar(length);
   made.quaternion.setFromUnitVectors(new Vector3(0, 0, 1), up);
   made.position.copy(middle).addScaledVector(up, offset / length - up.dot(middle));
+  made.receiveShadow = true;
   return made;
 }
 
 function box({ size, pose }) {
-  const position = [], normals = [], index = [];
-  for (const axis of [0, 1, 2]) {
-    for (const sign of [-1, 1]) {
-      const [u, v] = sign > 0 ? [(axis + 1) % 3, (axis + 2) % 3] : [(axis + 2) % 3, (axis + 1) % 3];
-      const first = position.length / 3;
-      for (const [a, b] of [[-1, -1], [1, -1], [1, 1], [-1, 1]]) {
-        const corner = [0, 0, 0], normal = [0, 0, 0];
-        corner[axis] = sign * size[axis] / 2;
-        corner[u] = a * size[u] / 2;
-        corner[v] = b * size[v] / 2;
-        normal[axis] = sign;
-        position.push(...corner);
-        normals.push(...normal);
-      }
-      index.push(first, first + 1, first + 2, first, first + 2, first + 3);
-    }
-  }
   const look = new MeshStandardMaterial({ color: COLOURS.wall, roughness: 0.9, transparent: true, opacity: 0.34, depthWrite: false });
-  const made = place(mesh(position, normals, index, look), pose);
+  const made = place(new Mesh(new BoxGeometry(...size), look), pose);
+  made.receiveShadow = true;
   made.renderOrder = 1;
   return made;
 }

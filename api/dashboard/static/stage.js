@@ -6,6 +6,9 @@ import {
 
 const FIELD_DEG = 32;
 const TURN = Math.PI / 24;
+/** Lengths of the scale bar [m], and its greatest length [pixels]. */
+const SCALES_M = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5];
+const SCALE_PX = 130;
 
 function lit(scene) {
   scene.add(new HemisphereLight(0xffffff, 0xb5aea4, 1.9));
@@ -89,7 +92,10 @@ export class LiveStage extends Stage {
     this.canvas = canvas;
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enableDamping = false;
-    this.controls.addEventListener("change", () => this.invalidate());
+    this.controls.addEventListener("change", () => {
+      this.invalidate();
+      this.onTurn?.(this.view);
+    });
     canvas.addEventListener("keydown", (event) => this.#key(event));
     new ResizeObserver(() => this.#resize()).observe(canvas);
     this.#resize();
@@ -97,19 +103,40 @@ export class LiveStage extends Stage {
 
   frame(group, direction, margin) {
     super.frame(group, direction, margin);
-    this.home = { at: this.camera.position.clone(), to: this.sphere.center.clone() };
     this.controls.target.copy(this.sphere.center);
     this.controls.minDistance = this.sphere.radius * 0.4;
     this.controls.maxDistance = this.sphere.radius * 12;
+    this.controls.update();
+    this.home = this.view;
+    this.invalidate();
+  }
+
+  /** Camera and its target relative to the middle, in radii of what is shown. */
+  get view() {
+    const { center, radius } = this.sphere;
+    return [this.camera.position, this.controls.target].flatMap((at) => at.clone().sub(center).divideScalar(radius).toArray());
+  }
+
+  set view(numbers) {
+    const { center, radius } = this.sphere;
+    [this.camera.position, this.controls.target].forEach((at, k) => at.fromArray(numbers, 3 * k).multiplyScalar(radius).add(center));
     this.controls.update();
     this.invalidate();
   }
 
   reset() {
-    this.camera.position.copy(this.home.at);
-    this.controls.target.copy(this.home.to);
-    this.controls.update();
-    this.invalidate();
+    this.view = this.home;
+  }
+
+  draw() {
+    super.draw();
+    const scale = this.canvas.parentElement.querySelector("[data-scale]");
+    if (!scale) return;
+    const distance = this.camera.position.distanceTo(this.controls.target);
+    const pixels = this.canvas.clientHeight / (2 * distance * Math.tan((FIELD_DEG * Math.PI) / 360)); // of a metre
+    const length = SCALES_M.findLast((one) => one * pixels < SCALE_PX) ?? SCALES_M[0];
+    scale.textContent = length < 0.01 ? `${1000 * length} mm` : `${100 * length} cm`;
+    scale.style.width = `${length * pixels}px`;
   }
 
   invalidate() {

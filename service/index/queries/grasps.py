@@ -67,6 +67,11 @@ class Grasps(database.IndexPart):
         query = query.where(*database.shard_scope_conditions(scope, grasps.c.shard_id))
         return GraspView(**self.database.first_row(query, f"grasp {row} in shard {shard_id!r}"))
 
+    def shard_of(self, prefix: str) -> str:
+        """Return the shard whose id starts with hexadecimal digits; NotFoundError if there is none."""
+        query = select(grasps.c.shard_id).where(grasps.c.shard_id.between(prefix, prefix + "g")).limit(1)
+        return str(self.database.first_row(query, f"shard {prefix!r}")["shard_id"])
+
     def matching_grasps(self, where: GraspFilter, *, limit: int) -> list[Grasp]:
         query = select(grasps.c.shard_id, grasps.c.row).order_by(grasps.c.shard_id, grasps.c.row).limit(limit)
         return [(found["shard_id"], found["row"]) for found in self.database.rows(query.where(*sql_conditions(where)))]
@@ -192,6 +197,8 @@ def conditions(where: GraspFilter | None) -> list[Test]:
         found.append(ColumnCondition("flag", grasps.c.scene_kind, compared, kind))
     if where.robust_weakest is not None:
         found.append(ColumnCondition("flag", grasps.c.robust_weakest, operator.eq, where.robust_weakest))
+    if where.digits:
+        found.append(ColumnCondition("flag", grasps.c.digits, in_op, where.digits))
     if where.neighbours is not None:
         found.append(ColumnCondition("flag", grasps.c.neighbours, operator.gt if where.neighbours else operator.eq, 0))
     found += [ColumnCondition(name, grasps.c[name], operator.ge, bound) for name, bound in where.at_least.items()]
@@ -224,10 +231,10 @@ def _rows_with_metric(
     connection: Connection, wanted: Sequence[Test], few: str | None, sort: GraspSort, size: int, start: Start
 ) -> list[Any]:
     by = grasps.c[sort.by]
-    if few is not None and few != sort.by:
-        return _sorted_rows(connection, [c.sql([few]) for c in wanted], sort, size, start)
     # The database index of the order also serves conditions on its metric and, for epsilon, on hand and object.
     served = [sort.by, "pair"] if sort.by == "epsilon" else [sort.by]
+    if few is not None and few not in served:
+        return _sorted_rows(connection, [c.sql([few]) for c in wanted], sort, size, start)
     inside = [c.sql(served) for c in wanted if c.group in served]
     outside = [c for c in wanted if c.group not in served]
     ordered = select(grasps).where(by.is_not(None), *inside)
@@ -242,7 +249,7 @@ def _rows_with_metric(
         if len(rows) >= size or _count_rows(connection, looked) < number:
             return rows
     # PostgreSQL combines indexes; SQLite would follow a single one row by row, which is slower than a full scan.
-    groups: list[str] | None = None if connection.dialect.name == "postgresql" else []
+    groups = None if connection.dialect.name == "postgresql" else [few] if few == "pair" else []
     return _sorted_rows(connection, [c.sql(groups) for c in wanted], sort, size, start)
 
 
@@ -362,6 +369,8 @@ class GraspFilter(Model):
     scene: str | None = None
     """Kind of the scene in which the grasp was planned; `any` means all kinds except free."""
     neighbours: bool | None = None
+    digits: tuple[int, ...] = ()
+    """Codes of the digits in contact, one of which must match; empty for all."""
     lift_hard: bool | None = None
     robust_weakest: str | None = None
     """Perturbed parameter of the first model in which the grasp fails."""

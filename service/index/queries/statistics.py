@@ -6,25 +6,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, Connection, Integer, cast, func, select
+from sqlalchemy import ColumnElement, Connection, func, select
 
 from graspd.service.index.database import IndexPart
-from graspd.service.index.queries.grasps import GraspFilter, Metric, conditions, estimate_row_count, sql_conditions
+from graspd.service.index.queries.grasps import GraspFilter, Metric, conditions, estimate_row_count
 from graspd.service.index.tables import grasps
 
 
 @dataclass(frozen=True)
-class MetricSummary:
+class Distribution:
+    """Histogram of one metric over the sampled grasps: equal bins from `low` to `high`, inclusive."""
+
     count: int
     mean: float
     low: float
     high: float
-
-
-@dataclass(frozen=True)
-class Distribution(MetricSummary):
-    """Histogram of one metric over the sampled grasps: equal bins from `low` to `high`, inclusive."""
-
     counts: list[int]
 
 
@@ -37,35 +33,6 @@ class GraspKinds:
 
 
 class Statistics(IndexPart):
-    def summaries(self, where: GraspFilter, metrics: Sequence[Metric]) -> dict[Metric, MetricSummary]:
-        """Return count, mean and range of each metric; metrics without any grasp are omitted."""
-        functions = (func.count, func.avg, func.min, func.max)
-        columns = [function(grasps.c[metric]) for metric in metrics for function in functions]
-        with self.database.read_transaction() as connection:
-            row = connection.execute(select(*columns).where(*sql_conditions(where))).one()
-        parts = {metric: row[4 * i : 4 * i + 4] for i, metric in enumerate(metrics)}
-        return {
-            metric: MetricSummary(int(count), float(mean), float(low), float(high))
-            for metric, (count, mean, low, high) in parts.items()
-            if count
-        }
-
-    def histogram(self, where: GraspFilter, metric: Metric, low: float, high: float, bins: int) -> list[int]:
-        """Return the number of grasps in each of `bins` equal bins of [low, high], both ends included."""
-        counts = [0] * bins
-        value = grasps.c[metric]
-        width = (high - low) / bins
-        with self.database.read_transaction() as connection:
-            place: ColumnElement[Any] = (value - low) / width if width > 0 else value * 0
-            if connection.dialect.name == "postgresql":
-                # A cast to integer rounds in PostgreSQL and truncates in SQLite; some versions of SQLite lack floor().
-                place = func.floor(place)
-            place = cast(place, Integer)
-            query = select(place, func.count()).where(value.between(low, high), *sql_conditions(where)).group_by(place)
-            for at, count in connection.execute(query):
-                counts[min(int(at), bins - 1)] += int(count)
-        return counts
-
     def compare_distributions(
         self, filters: Sequence[GraspFilter], metrics: Sequence[Metric], *, bins: int = 20, at_most: int = 20_000
     ) -> dict[Metric, list[Distribution | None]]:
@@ -84,21 +51,21 @@ class Statistics(IndexPart):
         return found
 
     def _sampled_values(self, where: GraspFilter, metrics: Sequence[Metric], at_most: int) -> NDArray[np.float64]:
+        rows, _ = self.sample(where, metrics, at_most)
+        return np.array([tuple(row) for row in rows], float).reshape(-1, len(metrics))
+
+    def sample(self, where: GraspFilter, columns: Sequence[str], at_most: int) -> tuple[Sequence[Any], float]:
+        """Return columns of a fair sample of about `at_most` grasps, and its share of all shards."""
         with self.database.read_transaction() as connection:
-            query = select(*(grasps.c[metric] for metric in metrics)).where(
-                *_sample_conditions(connection, where, at_most)
-            )
-            rows = [tuple(row) for row in connection.execute(query)]
-        return np.array(rows, float).reshape(-1, len(metrics))
+            tests, share = _sample_conditions(connection, where, at_most)
+            return connection.execute(select(*(grasps.c[name] for name in columns)).where(*tests)).all(), share
 
     def kinds(self, where: GraspFilter, *, at_most: int = 20_000) -> GraspKinds:
         """Count types and approach cells of about `at_most` grasps, sampled as in `compare_distributions`."""
         columns = grasps.c.grasp_type, grasps.c.approach_cell
         with self.database.read_transaction() as connection:
-            query = (
-                select(*columns, func.count()).where(*_sample_conditions(connection, where, at_most)).group_by(*columns)
-            )
-            rows = connection.execute(query).all()
+            tests, _ = _sample_conditions(connection, where, at_most)
+            rows = connection.execute(select(*columns, func.count()).where(*tests).group_by(*columns)).all()
         found = GraspKinds({}, {})
         for kind, cell, count in rows:
             for counts, value in ((found.types, kind), (found.cells, cell)):
@@ -107,12 +74,18 @@ class Statistics(IndexPart):
         return found
 
 
-def _sample_conditions(connection: Connection, where: GraspFilter, at_most: int) -> list[ColumnElement[bool]]:
-    """Return the conditions of a filter, restricted to a share of the shards with about `at_most` grasps."""
-    group = "job" if where.job is not None else "dataset" if where.dataset is not None else "pair"
-    share = min(1.0, at_most / max(1, estimate_row_count(connection, where, group)))
-    tests = [c.sql(["job", "dataset"]) for c in conditions(where)]
-    return [*tests, grasps.c.shard_id < f"{round(share * 16**8):08x}"] if share < 1.0 else tests
+def _sample_conditions(
+    connection: Connection, where: GraspFilter, at_most: int
+) -> tuple[list[ColumnElement[bool]], float]:
+    """Return the conditions of a filter on a share of the shards with `at_most` grasps; the share."""
+    groups = [name for name in ("job", "dataset", "tag") if getattr(where, name) is not None] or ["pair"]
+    least = min(estimate_row_count(connection, where, group) for group in groups)
+    share = min(1.0, at_most / max(1, least))
+    tests = [c.sql(["job", "dataset", "tag"]) for c in conditions(where)]
+    if share == 1.0:
+        return tests, share
+    bound = round(share * 16**8)
+    return [*tests, grasps.c.shard_id < f"{bound:08x}"], bound / 16**8
 
 
 def _distribution(values: NDArray[np.float64], bins: int, ends: tuple[float, float]) -> Distribution | None:

@@ -1,12 +1,19 @@
 """One grasp: its document, its page, the models it is shown with; and the list in both views."""
 
+import html
+import re
 import struct
+import subprocess
+from pathlib import Path
+from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from graspd.api.catalog import grasps
 from graspd.api.catalog.grasps import validated_by
+from graspd.service import user_cache
 from graspd.service.model.metrics import AXIS_MEANINGS, PerturbedParameter
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.shards import Shard, read_shard
@@ -120,3 +127,81 @@ def test_the_address_of_a_list_holds_its_filter_and_no_empty_fields(http: TestCl
     answer = http.get("/grasps", params=sent, follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (303, "/grasps?hand=allegro")
     assert http.get("/grasps", params={"hand": ""}, follow_redirects=False).headers["location"] == "/grasps"
+
+
+_FACET = re.compile(r'<li><a href="/grasps\?([^"]*)"><span>[^<]*</span> <span class="unit">(\d+)</span>')
+
+
+def test_a_facet_counts_what_its_link_finds(http: TestClient, services: Services) -> None:
+    finish_all(services, add_job(services, payload=True, robust_models=8))
+    finish_all(services, add_job(services, hand="shadow", object="block", validation="none"))
+    seen = set()
+    for start in ("", "hand=allegro&type=pinch", "valid=true&min_epsilon=0.25&max_payload_kg=0.8"):
+        found = _FACET.findall(http.get(f"/grasps?{start}").text)
+        seen |= {key for address, _ in found for key, _ in parse_qsl(html.unescape(address))}
+        for address, count in found:
+            listed = http.get(f"/v1/grasps?{html.unescape(address)}&limit=200").json()["items"]
+            assert len(listed) == int(count) > 0, (start, address)
+    assert seen >= {"hand", "object", "valid", "validated", "type", "robust_weakest"}
+    chips = http.get("/grasps?hand=allegro&min_epsilon=0.25").text
+    assert 'href="/grasps?min_epsilon=0.25" title="Remove this filter">Hand: allegro' in chips
+    assert 'href="/grasps?hand=allegro" title="Remove this filter">ε ≥ 0.250' in chips
+
+
+def test_facets_of_many_grasps_are_estimates_from_a_sample(
+    http: TestClient, services: Services, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish_all(services, add_job(services, grasps=32 * 12))
+    monkeypatch.setattr(grasps, "SAMPLE", 100)
+    page = http.get("/grasps").text
+    # Shards are drawn by their ids: of 12, 3.1 on average, each with 32 grasps; 0 to 8 in all but 1 of 1,000 draws.
+    assert 0 <= int(re.findall(r"about (\d[\d,]*) grasps", page)[0].replace(",", "")) <= 1100
+    assert len(http.get("/v1/grasps?limit=200").json()["items"]) == 200
+
+
+def test_grasps_are_compared_at_a_short_address_and_placed_on_a_map(http: TestClient, services: Services) -> None:
+    shard = finish_all(services, add_job(services))[0].shard_id
+    sent = {"grasp": [f"{shard}:{row}" for row in (1, 2, 30)]}
+    shown = http.post("/grasps/compare", data=sent)
+    assert shown.url.query.decode() == f"g={','.join(f'{shard[:12]}.{row}' for row in (1, 2, 30))}"
+    assert shown.text.count('data-viewer="grasp"') == 3 and "Contact area" in shown.text
+    for few in ([f"{shard}:1"], [f"{shard}:{row}" for row in range(5)]):
+        answer = http.post("/grasps/compare", data={"grasp": few})
+        assert answer.status_code == 422 and "select 2 to 4 grasps" in answer.text
+    assert http.get("/grasps/compare?g=ffffffffffff.1,nonsense", headers={"Accept": "text/html"}).status_code == 404
+    drawn = http.get("/grasps?view=map&type=power").text
+    assert drawn.count("<circle class=") == len(http.get("/v1/grasps?type=power&limit=200").json()["items"])
+    assert "No grasp matches" in http.get("/grasps?view=map&min_epsilon=99").text
+    lost = finish_all(services, add_job(services, seed=5))[0].key
+    (services.settings.data_dir / "store" / lost).unlink()
+    similar = http.get(f"/grasps/{shard}/3").text
+    assert similar.count('<li class="card grasp">') == 6 and f'value="{shard}:3" data-fixed' in similar
+
+
+def test_a_replay_is_simulated_once_and_a_missing_engine_is_told(
+    http: TestClient, services: Services, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    shard = finish_all(services, add_job(services))[0].shard_id
+    monkeypatch.setattr(user_cache, "cache_folder", lambda name: tmp_path / name)
+    ends: list[object] = [
+        subprocess.CalledProcessError(1, "python", stderr=b"...\nModuleNotFoundError: No module named 'mujoco'"),
+        subprocess.TimeoutExpired("python", 60),
+        subprocess.CompletedProcess("python", 0, b'{"outcome": "held", "way": []}'),
+    ]
+    commands = []
+
+    def run(command: list[str], **_: object) -> object:
+        commands.append(command)
+        end = ends.pop(0)
+        if isinstance(end, Exception):
+            raise end
+        return end
+
+    monkeypatch.setattr(subprocess, "run", run)
+    address = f"/v1/grasps/{shard}/3/replay"
+    for words in ("No module named 'mujoco'", "longer than 60 s"):
+        answer = http.get(address)
+        assert answer.status_code == 503 and words in answer.json()["detail"]
+    assert http.get(address).json() == http.get(address).json() == {"outcome": "held", "way": []}
+    assert len(commands) == 3 and commands[-1][-2:] == [shard, "3"]
+    assert http.get(f"/v1/grasps/{shard}/99/replay").status_code == 404

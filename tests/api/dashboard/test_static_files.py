@@ -12,7 +12,7 @@ from jinja2 import meta, nodes
 from graspd.api.dashboard.rendering import STATIC, environment
 
 #: Functions that `render` gives to every page; what a macro is called with.
-GIVEN: Final = {"may_change", "caller"}
+GIVEN: Final = {"may_change", "caller", "address"}
 ENVIRONMENT: Final = environment()
 TEMPLATES: Final = sorted(ENVIRONMENT.list_templates())
 FOLDERS = (STATIC / "vendor", Path(__file__).parents[2] / "browser" / "vendor")

@@ -143,18 +143,6 @@ def index(tmp_path: Path, values: np.ndarray) -> Iterator[Index]:
     opened.close()
 
 
-def test_summaries_and_histograms_are_those_of_numpy(index: Index, values: np.ndarray) -> None:
-    summaries = index.statistics.summaries(GraspFilter(valid=True), ("epsilon", "contact_area_cm2"))
-    found, passed = summaries.pop("epsilon"), values[::2]
-    assert found.count == len(passed) and summaries == {}
-    assert (found.mean, found.low, found.high) == pytest.approx((passed.mean(), passed.min(), passed.max()))
-    assert index.statistics.summaries(GraspFilter(hand="other"), ("epsilon",)) == {}
-    low, high, one = float(values.min()), float(values.max()), float(values[3])
-    expected, _ = np.histogram(values, BINS, (low, high))
-    assert index.statistics.histogram(GraspFilter(), "epsilon", low, high, BINS) == expected.tolist()
-    assert index.statistics.histogram(GraspFilter(), "epsilon", one, one, BINS) == [1] + [0] * (BINS - 1)
-
-
 def test_distributions_of_few_grasps_are_exact(index: Index, values: np.ndarray) -> None:
     found = index.statistics.compare_distributions(
         [GraspFilter(valid=True)], ("epsilon", "contact_area_cm2"), bins=BINS
@@ -162,7 +150,9 @@ def test_distributions_of_few_grasps_are_exact(index: Index, values: np.ndarray)
     passed = values[::2]
     ((one,),) = found.values()
     assert one is not None and one.counts == np.histogram(passed, BINS)[0].tolist()
+    assert (one.count, one.low, one.high) == (len(passed), passed.min(), passed.max())
     assert one.mean == pytest.approx(passed.mean())
+    assert index.statistics.compare_distributions([GraspFilter(hand="other")], ("epsilon",)) == {}
 
 
 def test_distributions_of_many_grasps_come_from_a_fair_sample(index: Index) -> None:

@@ -43,6 +43,7 @@ from graspd.worker.stages import assets, ingest, render, scene, synthesize
 from graspd.worker.stages.assets import object_of
 from graspd.worker.stages.context import StopReason, TaskContext, batch_seed
 from graspd.worker.stages.ranges import base_rows, split_into_batches
+from graspd.worker.stages.replay import replay
 from tests.fakes import job_record, message_for
 from tests.networks import LEARNED, network_files, random_network
 
@@ -126,6 +127,35 @@ def test_pictures_show_the_scene_with_and_without_the_best_hand(table: Bench) ->
     assert shown.tolist() == [max(np.flatnonzero(base["grasp/scene_index"] == s), key=epsilon.item) for s in (0, 1)]
     assert (views["image/rgb_hand"] != views["image/rgb"]).any(axis=(1, 2, 3)).all()
     assert set(np.unique(views["image/segmentation"])) <= {0, 1, 2}
+
+
+def test_a_replay_lifts_what_the_validator_lifted_and_its_forces_balance(table: Bench) -> None:
+    base = table.made(Stage.SYNTHESIZE)
+    found = replay(table.store, str(base.attributes["shard_id"]), 2)
+    way = found["way"]
+    assert found["outcome"] == "lifted", "the verdict of the file"
+    assert [point["name"] for point in way if point["name"]] == ["standoff", "pregrasp", "grasp", "squeeze", "lift"]
+    assert (np.diff([point["place"] for point in way]) > 0).all() and way[-1]["place"] == 4
+    contacts = np.array(way[-1]["contacts"])
+    load = np.array(way[-1]["load"])
+    # The object rises against its weight by 10 cm; the validator's limit of motion in the hand is 5 cm.
+    assert 0.05 < -np.dot(way[-1]["object_pose"][:3], load) / np.linalg.norm(load) < 0.15
+    # Held still: contact forces balance the weight, up to the drift within the hold's early end.
+    np.testing.assert_allclose(contacts[:, 6:9].sum(axis=0), -load, atol=0.05 * np.linalg.norm(load))
+    assert np.abs(contacts[:, 9:12].sum(axis=0)).max() < 0.1 * np.linalg.norm(load) * 0.05, "10 % of the weight at 5 cm"
+    assert (np.einsum("ci,ci->c", contacts[:, 3:6], contacts[:, 6:9]) >= 0).all(), "contacts push"
+    assert contacts[:, 12].all(), "the table is left"
+
+
+def test_a_replay_of_a_free_grasp_pushes_in_six_directions(table: Bench) -> None:
+    bench = Bench(table.store)
+    assert bench.run(**TABLE | {"scene": "free", "scenes": 0, "views": 0, "grasps": 1})[0] is EventKind.FINISHED
+    base = bench.made(Stage.SYNTHESIZE)
+    found = replay(bench.store, str(base.attributes["shard_id"]), 0)
+    phases = dict.fromkeys(point["phase"] for point in found["way"])
+    assert found["outcome"] == "held" and len(phases) == 8, "approach, closing, six pushes"
+    pushed = {point["phase"]: np.sign(np.round(point["load"], 6)).tolist() for point in found["way"][1:]}
+    assert pushed["closing"] == [0, 0, 0] and pushed["pushed along -y"] == [0, -1, 0]
 
 
 def test_readers_give_way_of_a_grasp_and_the_grasps_of_a_picture(table: Bench) -> None:
