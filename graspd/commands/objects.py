@@ -113,16 +113,20 @@ def fetch(
     drawn = sorted(random.Random(seed).sample(sorted(objects), count)) if 0 < count < len(objects) else list(objects)
     folder = to or user_cache.cache_folder("sets") / f"{name}-{published.version}"
     reports = list(_prepare_set({one: objects[one] for one in drawn}, published, folder))
-    if json:
-        print_json({"objects": reports, "folder": str(folder), **_summary(reports)})
-    else:
+    if not json:
         typer.echo("\n".join(summary_lines(reports)))
     accepted = [one["name"] for one in reports if one["verdict"] != "refuse"]
     if to is None and accepted:
-        from graspd.client.add_commands import add_set
+        from graspd.client.add_commands import upload_set
+        from graspd.client.reports import open_client
 
-        files = {one: _read_folder(folder / one) for one in accepted}
-        add_set(files, name=name, prefix=None, options={}, split=True, wait=True, url=url, json=json)
+        with open_client(url) as client:
+            told = upload_set(client, {one: _read_folder(folder / one) for one in accepted}, name, split=True)
+        if not json:
+            added = sum(one["verdict"] != "refuse" for one in told)
+            typer.echo(f"sets {name}, {name}-train and {name}-report: {added} objects")
+    if json:
+        print_json({"objects": reports, "folder": str(folder), **_summary(reports)})
 
 
 #: Record of the check of a fetched object, beside its files; the last file that is written.

@@ -38,8 +38,8 @@ def shape_facts(obj: ObjectModel) -> dict[str, Any]:
         length > SLENDER * width,
         True,
     )
-    flat, long = np.rint(4 * np.log2([width / thickness, length / width])).astype(int)
-    family = f"{flat}-{long}-{int(20 * solid)}"
+    bins = np.rint([4 * np.log2(width / thickness), 4 * np.log2(length / width), 20 * solid])
+    family = "-".join(f"{number:.0f}" for number in bins + 0.0)
     return {
         "class": CLASSES[applies.index(True)],
         "family": family,
