@@ -52,7 +52,7 @@ GRIPPERS: Final = "robosuite/models/assets/grippers/"
 #: Object whose rate others are compared with, and its number of grasps per hand.
 MUG, MUG_GRASPS = "mug", 64
 SHOWN, EDGE, WORST = 40, 176, 10
-_POLL_S: Final = 5.0
+_POLL_S, _PATIENCE_S = 5.0, 900.0
 
 
 @dataclass
@@ -94,28 +94,30 @@ def main(
     run = ExecutionContext(work, {k: v for k, v in os.environ.items() if not k.startswith("GRASPD_")}, workers=workers)
     kept, state = Kept.load(work / "run.json"), work / "run.json"
     run.up()
-    add_hands(run, hands.split(","))
-    if not kept.fetched:
-        kept.fetched = run.graspd("objects", "fetch", name, "--count", str(objects))
-        kept.add_s = time.monotonic() - began
-        kept.save(state)
-    found = {}
-    for stage, member, count in (("mug", MUG, MUG_GRASPS), ("objects", name, grasps)):
-        wanted = {
-            f"{stage}-{scene}": (
-                *("datasets", "create", f"{stage}-{scene}", "--spec", str(SPECS / f"{scene}.toml")),
-                *("--hands", hands, "--objects", member, "--grasps", str(count), "--yes"),
-            )
-            for scene in scenes.split(",")
-        }
-        follow(run, wanted, kept, end=end, kill_s=60 * kill_minutes if stage == "objects" else math.inf)
-        kept.save(state)
-        found |= {one: list(run.client().cells(one)) for one in wanted}
-    timings = index_timings(run, [f"objects-{scene}" for scene in scenes.split(",")], work)
-    shapes = {one["name"]: one for one in kept.fetched["objects"]}
-    sheet = out.with_suffix(".webp")
-    draw_sheet(run, [f"objects-{scene}" for scene in scenes.split(",")], shapes, sheet)
-    run.stop()
+    try:
+        add_hands(run, hands.split(","))
+        if not kept.fetched:
+            kept.fetched = run.graspd("objects", "fetch", name, "--count", str(objects))
+            kept.add_s = time.monotonic() - began
+            kept.save(state)
+        found = {}
+        for stage, member, count in (("mug", MUG, MUG_GRASPS), ("objects", name, grasps)):
+            wanted = {
+                f"{stage}-{scene}": (
+                    *("datasets", "create", f"{stage}-{scene}", "--spec", str(SPECS / f"{scene}.toml")),
+                    *("--hands", hands, "--objects", member, "--grasps", str(count), "--yes"),
+                )
+                for scene in scenes.split(",")
+            }
+            follow(run, wanted, kept, end=end, kill_s=60 * kill_minutes if stage == "objects" else math.inf)
+            kept.save(state)
+            found |= {one: list(run.client().cells(one)) for one in wanted}
+        timings = index_timings(run, [f"objects-{scene}" for scene in scenes.split(",")], work)
+        shapes = {one["name"]: one for one in kept.fetched["objects"]}
+        sheet = out.with_suffix(".webp")
+        draw_sheet(run, [f"objects-{scene}" for scene in scenes.split(",")], shapes, sheet)
+    finally:
+        run.stop()
     command = f"--set {name} --objects {objects} --grasps {grasps} --hands {hands} --scenes {scenes}"
     out.write_text(page(found, shapes, kept, timings, command, sheet.name, data=work / "data"))
     typer.echo(out.read_text())
@@ -134,11 +136,10 @@ def add_hands(run: ExecutionContext, wanted: Sequence[str]) -> None:
         file.write_bytes(data)
     for one in entries:
         path = str(run.folder / "hands" / one.path)
-        typer.echo(
-            run.graspd("hands", "add", path, "--name", one.name, "--licence", package.licence, "--no-self-test")[
-                "message"
-            ]
+        run.graspd(
+            "hands", "add", path, "--name", one.name, "--licence", package.licence, "--no-self-test", "--no-wait"
         )
+        typer.echo(run.client().wait_for_check(AssetKind.HAND, one.name, timeout_s=_PATIENCE_S).message)
 
 
 def follow(run: ExecutionContext, wanted: dict[str, Sequence[str]], kept: Kept, *, end: float, kill_s: float) -> None:
@@ -168,9 +169,8 @@ def follow(run: ExecutionContext, wanted: dict[str, Sequence[str]], kept: Kept, 
                 run.graspd(*command)
         if now > killed + kill_s:
             killed = now
-            busy = [
-                one["pid"] for one in run.client().send("GET", "/v1/workers").json()["items"] if one["state"] == "busy"
-            ]
+            workers = run.client().send("GET", "/v1/workers").json()
+            busy = [one["pid"] for one in workers if one["state"] == "busy"]
             with suppress(ProcessLookupError, IndexError):
                 os.kill(random.choice(busy), signal.SIGKILL)
                 kept.workers_killed += 1

@@ -8,7 +8,7 @@ import re
 import shutil
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -29,7 +29,7 @@ from graspd.service.store.asset_summary import print_check, verdict_line
 from graspd.service.store.assets import builtin_names
 from graspd.service.store.body_files import find_body
 from graspd.service.store.object_sets import Objects, find_set_objects
-from graspd.service.store.set_packages import PublishedSet, fetch_objects, find_set
+from graspd.service.store.set_packages import MOST_KG, PublishedSet, fetch_objects, find_set
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.prepare import files_from_path, object_from_path, revision
 
@@ -164,8 +164,7 @@ def _prepare_object(task: tuple[str, dict[str, bytes], PublishedSet, Path]) -> N
     if report["verdict"] != "refuse":
         said: dict[str, Any] = {"licence": published.licence, "source": published.source, "file": find_body(files)}
         if published.density:
-            heavy = facts["mass_kg"] > published.most_kg
-            said |= {"mass": published.most_kg} if heavy else {"density": published.density}
+            said |= {"mass": MOST_KG} if facts["mass_kg"] > MOST_KG else {"density": published.density}
         for inner, data in {**files, "asset.json": json_codec.dumps(said).encode()}.items():
             user_cache.write_atomically(folder / inner, [data])
     kept = {key: report[key] for key in ("verdict", "message", "repairs")}
@@ -187,14 +186,10 @@ def _summary(reports: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "accepted": len(accepted),
         "refused": Counter(kind_of(one["message"].partition(": ")[2]) for one in reports if one not in accepted),
-        "repairs": Counter(kind for one in accepted for kind in {kind_of(said) for said in _said(one)}),
+        "repairs": Counter(kind for one in accepted for kind in set(map(kind_of, one["repairs"] + one["notes"]))),
         "shapes": dict(sorted(shapes.items())),
         "check_s": {"p50": round(half, 2), "p99": round(most, 2), "largest": max(one["seconds"] for one in reports)},
     }
-
-
-def _said(report: Mapping[str, Any]) -> Iterable[str]:
-    return (*report["repairs"], *report["notes"])
 
 
 def kind_of(message: str) -> str:

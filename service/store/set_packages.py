@@ -19,6 +19,8 @@ from graspd.service.store import body_files
 from graspd.service.store.assets import check_path
 from graspd.service.store.object_sets import Objects, group_objects
 
+#: Upper bound of a mass by density [kg].
+MOST_KG: Final = 1.0
 #: Limits of the selected files of a wheel, and of the time of a download [s].
 _MAX_BYTES, _MAX_MEMBERS, _DOWNLOAD_S = 1 << 30, 20_000, 3600
 #: Wheels for one platform, so that every machine reads the same file.
@@ -36,9 +38,7 @@ class PublishedSet:
     licence: str
     source: str
     density: float | None = None
-    """Density [kg/m^3] of objects whose stated masses are placeholders; None: the stated masses."""
-    most_kg: float = 1.0
-    """Upper bound of a mass by density."""
+    """Density [kg/m^3] instead of stated masses that are placeholders, up to `MOST_KG`."""
 
 
 SETS: Final = {
