@@ -78,6 +78,8 @@ def add_object(
     json: JsonFlag = False,
 ) -> None:
     """Upload an object or a set of objects, wait for the check, and report repairs."""
+    if split and not wait:
+        raise InputError("--split needs the checks of the objects; omit --no-wait")
     sizes = parse_sizes(options.pop("scale_to", None))
     options |= provenance(licence, source) | ({"scale_to": sizes[0]} if len(sizes) == 1 else {})
     if len(sizes) > 1:
