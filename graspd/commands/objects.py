@@ -110,7 +110,8 @@ def fetch(
     """Fetch a published set from the package index, check it, and add it with its train and report sets."""
     published = find_set(name)
     objects = fetch_objects(name)
-    drawn = sorted(random.Random(seed).sample(sorted(objects), count)) if 0 < count < len(objects) else list(objects)
+    # A larger count draws the same objects and more.
+    drawn = sorted(random.Random(seed).sample(sorted(objects), len(objects))[: count or None])
     folder = to or user_cache.cache_folder("sets") / f"{name}-{published.version}"
     reports = list(_prepare_set({one: objects[one] for one in drawn}, published, folder))
     if not json:
