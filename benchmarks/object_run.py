@@ -97,11 +97,11 @@ def main(
     kept, state = Kept.load(work / "run.json"), work / "run.json"
     run.up()
     try:
-        add_hands(run, hands.split(","))
         if not kept.fetched:
             kept.fetched = run.graspd("objects", "fetch", name, "--count", str(objects))
             kept.add_s = time.monotonic() - began
             kept.save(state)
+        add_hands(run, hands.split(","))
         shapes = {one["name"]: one for one in kept.fetched["objects"] if one["verdict"] != "refuse"}
         drawn = random.Random(0).sample(sorted(shapes), len(shapes))
         parts = [drawn[start : start + PART] for start in range(0, len(drawn), PART)]

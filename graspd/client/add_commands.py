@@ -213,10 +213,12 @@ def upload_set(
         _upload(client, f"{prefix}-{name}" if prefix else name, files, options or {}, shared=shared)
         for name, files in objects.items()
     ]
+    patience_s = _CHECK_S
     for one in told:
         if wait and one["verdict"] is None:
-            asset = client.wait_for_check(AssetKind.OBJECT, one["digest"])
-            one.update(_findings(asset))
+            one.update(_findings(client.wait_for_check(AssetKind.OBJECT, one["digest"], timeout_s=patience_s)))
+            # A worker is running, but may have longer tasks.
+            patience_s = _SELF_TEST_S
         if say is not None:
             say(verdict_line(one))
     if taken := [one["name"] for one in told if one["verdict"] != "refuse"]:

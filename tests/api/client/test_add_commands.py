@@ -70,7 +70,7 @@ def test_a_sweep_makes_a_set_of_all_sizes(monkeypatch: pytest.MonkeyPatch, http:
 
 
 def test_a_split_makes_a_set_of_each_side(monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path) -> None:
-    def checked(client: Client, kind: AssetKind, digest: str) -> AssetView:
+    def checked(client: Client, kind: AssetKind, digest: str, timeout_s: float) -> AssetView:
         """As a worker checks it: the box is a train object, the mug a report object."""
         asset = client.asset(kind, digest)
         side = "report" if "mug" in asset.name else "train"
