@@ -1,6 +1,6 @@
 """A published set of objects x five hands through a real service with two workers, which are killed now and then.
 
-    python -m benchmarks.object_run --work DIR --objects 100 --grasps 32 --minutes 60 --out docs/results/objects.md
+    python -m benchmarks.object_run --work DIR --objects 100 --grasps 32 --minutes 50
 
 Fetches the set, adds two published hands, and makes the datasets of examples/objects/free.toml and table.toml. Every
 few minutes a worker gets SIGKILL; once, at a third of a part of the objects, all processes do, and the same commands
@@ -78,7 +78,7 @@ class Kept:
 
 def main(
     work: Annotated[Path, typer.Option(help="Folder of the service and of the run's state.")],
-    out: Annotated[Path, typer.Option(help="Page to write.")] = Path("docs/results/objects.md"),
+    out: Annotated[Path, typer.Option(help="Page to write.")] = Path("docs", "results", "objects.md"),
     name: Annotated[str, typer.Option("--set", help="Name of the published set.")] = "pybullet-random",
     objects: Annotated[int, typer.Option(help="Number of objects, drawn at random; 0: all.")] = 100,
     grasps: Annotated[int, typer.Option(help="Valid grasps of each hand, object and scene.")] = 32,
