@@ -47,6 +47,7 @@ class ExecutionContext:
     environment: dict[str, str]
     processes: list[int] = field(default_factory=list)
     url: str = ""
+    workers: int = 1
 
     def up(self) -> float:
         start = time.monotonic()
@@ -60,6 +61,8 @@ class ExecutionContext:
             "0",
             "--data-dir",
             str(self.folder / "data"),
+            "--workers",
+            str(self.workers),
             "--json",
         ]
         child = subprocess.Popen(

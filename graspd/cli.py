@@ -71,6 +71,7 @@ JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("admin", "store", "graspd.service.run.store_commands", "Verify and repair the store."),
     ("hands", "check", "graspd.commands.hands", "Check whether a hand can be used, and report guesses."),
     ("objects", "check", "graspd.commands.objects", "Check whether a mesh can be used, and report repairs."),
+    ("objects", "fetch", "graspd.commands.objects", "Fetch a published set of objects from the package index."),
     ("datasets", "balance", "graspd.commands.curate", "Write a subset in which no kind of grasps dominates."),
     ("datasets", "card", "graspd.commands.exchange", "Write a dataset's card: contents, quality, biases, plots."),
     ("datasets", "publish", "graspd.commands.exchange", "Write a dataset for a hub, and upload it."),

@@ -429,6 +429,15 @@ STUDIES: Final = (
         ("python -m benchmarks.matrix DATA --data-dir WORK/matrix --out OUT/results/matrix.md",),
     ),
     Study(
+        "objects",
+        "a published set of objects and five hands, with killed workers",
+        ("results/objects.*",),
+        ("python -m benchmarks.object_run --work WORK/objects --out OUT/results/objects.md",),
+        ("python -m benchmarks.object_run --work WORK/objects --objects 4 --grasps 8 --out OUT/results/objects.md",),
+        stages=ALL,
+        seeds=(0,),
+    ),
+    Study(
         "predictor",
         "proposals of networks trained on grasps on tables",
         ("results/predictor.json", "results/predictor-barrett.png", "results/predictor-allegro.png"),

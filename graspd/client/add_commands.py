@@ -17,6 +17,7 @@ from graspd.client.client import Client
 from graspd.client.reports import UrlOption, open_client, show_asset
 from graspd.service.cli import JsonFlag, print_json
 from graspd.service.command_options import with_options
+from graspd.service.index.views import AssetView
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.asset_options import (
@@ -70,19 +71,22 @@ def add_object(
     options: dict[str, Any],
     licence: LicenceOption = None,
     source: SourceOption = None,
+    split: Annotated[bool, typer.Option("--split", help="Also make the sets NAME-train and NAME-report.")] = False,
     shared: SharedOption = False,
     wait: WaitOption = True,
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Upload an object or a set of objects, wait for the check, and report repairs."""
+    if split and not wait:
+        raise InputError("--split needs the checks of the objects; omit --no-wait")
     sizes = parse_sizes(options.pop("scale_to", None))
     options |= provenance(licence, source) | ({"scale_to": sizes[0]} if len(sizes) == 1 else {})
     if len(sizes) > 1:
         swept = scale_objects(find_set_objects(file) or single_object(file, name), sizes)
-        add = partial(add_set, swept, name=name or name_of_set(file), prefix=None)
+        add = partial(add_set, swept, name=name or name_of_set(file), prefix=None, split=split)
     elif files := find_set_objects(file):
-        add = partial(add_set, files, name=name or name_of_set(file), prefix=name)
+        add = partial(add_set, files, name=name or name_of_set(file), prefix=name, split=split)
     else:
         add = partial(_add, AssetKind.OBJECT, file, name)
     add(options=options, shared=shared, wait=wait, url=url, json=json)
@@ -168,6 +172,7 @@ def add_set(
     name: str,
     prefix: str | None,
     options: dict[str, Any],
+    split: bool = False,
     shared: bool = False,
     wait: bool,
     url: str | None,
@@ -176,7 +181,8 @@ def add_set(
     """Upload objects as a set and report it; raise InputError if objects were refused."""
     with open_client(url) as client:
         say = None if json else typer.echo
-        told = upload_set(client, objects, name, prefix=prefix, options=options, shared=shared, wait=wait, say=say)
+        given: dict[str, Any] = {"prefix": prefix, "options": options, "split": split, "shared": shared, "wait": wait}
+        told = upload_set(client, objects, name, **given, say=say)
     refused = [one["name"] for one in told if one["verdict"] == "refuse"]
     taken = len(told) - len(refused)
     if json:
@@ -194,11 +200,12 @@ def upload_set(
     *,
     prefix: str | None = None,
     options: dict[str, Any] | None = None,
+    split: bool = False,
     shared: bool = False,
     wait: bool = True,
     say: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Upload objects, wait for their checks, and make a set of those that are not refused.
+    """Upload objects, wait for their checks, and make a set of those that are not refused; `split`: also its sides.
 
     Return name, verdict, message and repairs of each object; `say` is called with a line after each check.
     """
@@ -206,14 +213,19 @@ def upload_set(
         _upload(client, f"{prefix}-{name}" if prefix else name, files, options or {}, shared=shared)
         for name, files in objects.items()
     ]
+    patience_s = _CHECK_S
     for one in told:
         if wait and one["verdict"] is None:
-            asset = client.wait_for_check(AssetKind.OBJECT, one["digest"])
-            one.update(verdict=asset.verdict, message=asset.message or "", repairs=asset.repairs)
+            one.update(_findings(client.wait_for_check(AssetKind.OBJECT, one["digest"], timeout_s=patience_s)))
+            # A worker is running, but may have longer tasks.
+            patience_s = _SELF_TEST_S
         if say is not None:
             say(verdict_line(one))
     if taken := [one["name"] for one in told if one["verdict"] != "refuse"]:
         client.add_object_set(set_name, taken)
+    for side in ("train", "report") if split else ():
+        if of_side := [one["name"] for one in told if one.get("split") == side and one["verdict"] != "refuse"]:
+            client.add_object_set(f"{set_name}-{side}", of_side)
     return told
 
 
@@ -227,5 +239,9 @@ def _upload(
             asset = client.upload(AssetKind.OBJECT, archive, name=name, options=options, shared=shared)
     except InputError as error:
         return {"name": name, "verdict": "refuse", "message": str(error), "repairs": []}
-    told = {"name": asset.name, "digest": asset.digest, "verdict": asset.verdict}
-    return told | {"message": asset.message or "", "repairs": asset.repairs}
+    return {"name": asset.name, "digest": asset.digest, **_findings(asset)}
+
+
+def _findings(asset: AssetView) -> dict[str, Any]:
+    side = asset.facts.get("shape", {}).get("split")
+    return {"verdict": asset.verdict, "message": asset.message or "", "repairs": asset.repairs, "split": side}

@@ -30,6 +30,7 @@ from graspd.service.model.scene_spec import check_object_name, parse_scene_optio
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.export import export_shards
 from graspd.service.pipeline.datasets.spec import DatasetRequest, Estimate, Matrix
+from graspd.service.store.assets import MAX_NAME
 from graspd.service.store.object_sets import Objects, find_set_objects
 
 SpecOption = Annotated[Path | None, typer.Option("--spec", help="TOML or JSON file; options take precedence.")]
@@ -324,11 +325,13 @@ def _matrix(client: Client, asked: DatasetPlan) -> tuple[Objects | None, dict[st
     matrix: dict[str, Any] = {"hands": [w.strip() for w in asked.hands.split(",") if w.strip()], **asked.options}
     known = {found.name: found.objects for found in client.object_sets()}
     path = Path(objects)
-    # A bare name means the known set, even if a folder of that name exists; ./NAME is the folder.
-    if objects not in known and (files := find_set_objects(path)):
+    # A bare name means the known set, even if a folder of that name exists; ./NAME is the folder. Long lists of names
+    # are no paths.
+    may_be_path = objects not in known and ("/" in objects or len(objects) <= MAX_NAME)
+    if may_be_path and (files := find_set_objects(path)):
         matrix |= {"objects": sorted(files), "sets": [name_of_set(path)]}
         return files, asked.matrix_per_cell(matrix, len(files))
-    if objects not in known and path.is_file():
+    if may_be_path and path.is_file():
         raise InputError(f"{objects} is one object; run `graspd objects add {objects}`, then give its name here")
     if "/" in objects:
         raise InputError(f"there is no folder {objects}; give one that exists, or names of objects and sets")

@@ -11,12 +11,14 @@ from graspd.service.cli import load_settings
 from graspd.service.model.errors import InputError, LimitError
 from graspd.service.model.names import shorten_name
 from graspd.service.store import body_files
-from graspd.service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
+from graspd.service.store.assets import UNPACK_FACTOR, unpack
 from graspd.service.store.usd_layers import SUFFIXES as USD
 
 SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb", *USD)
 #: Suffixes of the files that are read, besides `asset.json`.
 _TAKEN: Final = (*SUFFIXES, ".dae", ".msh", *body_files.SUFFIXES)
+#: Limit on the files of a folder: an object of a published set has three.
+_FOLDER_FILES: Final = 20_000
 #: Stems of mesh files in order of preference, if an object has several meshes: closed and cleaned scans first.
 PREFERRED: Final = ("clean", "nontextured", "textured_simple", "textured", "collision", "visual", "raw")
 #: Names of inner folders that describe the processing of a mesh, not the object.
@@ -69,8 +71,8 @@ def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
         if not wanted or not file.is_file() or not file.resolve().is_relative_to(root):
             continue
         total += file.stat().st_size
-        if total > limit_bytes or len(files) >= MAX_FILES:
-            raise LimitError(f"{path} holds more than {limit_bytes} bytes or {MAX_FILES} meshes; split it")
+        if total > limit_bytes or len(files) >= _FOLDER_FILES:
+            raise LimitError(f"{path} holds more than {limit_bytes} bytes or {_FOLDER_FILES} files; split it")
         files[file.relative_to(root).as_posix()] = file.read_bytes()
     return files
 

@@ -10,6 +10,7 @@ from graspd.service.model.object_options import ObjectOptions
 from graspd.worker.objects.options import parse_options
 from graspd.worker.objects.prepare import apply_options, build_model, main_mesh, repaired_mesh
 from graspd.worker.objects.repair import RepairedMesh
+from graspd.worker.objects.shapes import shape_facts
 
 #: Simplification bound of the prepared mesh in the report [m]: that of the standard fidelity.
 REPORT_ERROR_M = 3e-4
@@ -64,6 +65,7 @@ def _facts(mesh: RepairedMesh, face_error_m: float, options: ObjectOptions) -> d
         "origin_distance_m": away,
         "radius_m": model.radius,
         "watertight": model.watertight,
+        "shape": shape_facts(model),
         "units": options.units,
         "parts": mesh.parts.listed if mesh.parts else [],
         "colours": mesh.parts.listed_colours if mesh.parts else [],

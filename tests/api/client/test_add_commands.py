@@ -11,6 +11,7 @@ from graspd.client import add_commands
 from graspd.client.add_commands import add_object, upload_of
 from graspd.client.client import Client
 from graspd.service.cli import CommandGroup
+from graspd.service.index.views import AssetView
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.asset_options import parse_sizes
@@ -39,7 +40,8 @@ def add(monkeypatch: pytest.MonkeyPatch, http: TestClient, *arguments: str) -> t
     monkeypatch.setattr(add_commands, "open_client", lambda url: client)
     app = CommandGroup()
     app.command()(add_object)
-    result = CliRunner().invoke(app, [*arguments, "--no-wait", "--json"])
+    waiting = [] if "--split" in arguments else ["--no-wait"]
+    result = CliRunner().invoke(app, [*arguments, *waiting, "--json"])
     return result.exit_code, json.loads(result.stdout.splitlines()[-1])
 
 
@@ -65,6 +67,23 @@ def test_a_sweep_makes_a_set_of_all_sizes(monkeypatch: pytest.MonkeyPatch, http:
     code, told = add(monkeypatch, http, str(folder / "toys"), "--scale-to", "0.06,0.08")
     assert (code, told["set"]) == (0, "toys")
     assert http.get("/v1/object-sets/toys").json()["objects"] == ["ball-60mm", "ball-80mm", "rod-60mm", "rod-80mm"]
+
+
+def test_a_split_makes_a_set_of_each_side(monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path) -> None:
+    def checked(client: Client, kind: AssetKind, digest: str, timeout_s: float) -> AssetView:
+        """As a worker checks it: the box is a train object, the mug a report object."""
+        asset = client.asset(kind, digest)
+        side = "report" if "mug" in asset.name else "train"
+        return asset.model_copy(update={"verdict": "accept", "facts": {"shape": {"split": side}}})
+
+    monkeypatch.setattr(Client, "wait_for_check", checked)
+    add(monkeypatch, http, str(folder), "--split")
+    sets = {name: http.get(f"/v1/object-sets/{name}").json()["objects"] for name in ("ycb", "ycb-train", "ycb-report")}
+    assert sets == {"ycb": ["003_cracker_box", "025_mug"], "ycb-train": ["003_cracker_box"], "ycb-report": ["025_mug"]}
+    app = CommandGroup()
+    app.command()(add_object)
+    refused = CliRunner().invoke(app, [str(folder), "--split", "--no-wait"])
+    assert refused.exit_code == 2 and "--split needs the checks" in refused.output
 
 
 @pytest.mark.parametrize("text", ["0", "-0.1", "small", "0.1,", "inf", "nan"])

@@ -210,6 +210,7 @@ def test_an_object_is_added_from_a_file_and_its_licence_kept(graspd: Shell, tmp_
         ("datasets create --hands allegro --objects mug", "give a name"),
         (f"{' '.join(CREATE)} --yes --hands foot", "there is no hand or object 'foot'"),
         (f"{' '.join(CREATE)} --yes --objects no/such/folder", "there is no folder no/such/folder"),
+        (f"{' '.join(CREATE)} --yes --objects {','.join(['foot'] * 99)}", "there is no hand or object 'foot'"),
         (f"{' '.join(CREATE)} --yes --grasps 0", "--grasps: "),
         (f"{' '.join(CREATE)} --yes --views 2", "views need scenes"),
         (f"{' '.join(CREATE)} --yes --fidelity auto --target gsr>=0.5", "graspd chart --publish"),

@@ -1,0 +1,433 @@
+"""A published set of objects x five hands through a real service with two workers, which are killed now and then.
+
+    python -m benchmarks.object_run --work DIR --objects 100 --grasps 32 --minutes 50
+
+Fetches the set, adds two published hands, and makes the datasets of examples/objects/free.toml and table.toml. Every
+few minutes a worker gets SIGKILL; once, at a third of a part of the objects, all processes do, and the same commands
+continue. The same command continues a run that ended early, and writes its page."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import platform
+import random
+import signal
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+import typer
+from PIL import Image
+
+import graspd
+from benchmarks.gallery import HANDS
+from benchmarks.matrix import ExecutionContext
+from graspd.api.formatting import duration, size
+from graspd.commands.objects import kind_of
+from graspd.service.index.views import CellView
+from graspd.service.model.cores import available_cores
+from graspd.service.model.states import AssetKind
+from graspd.service.model.version import PACKAGE_VERSION
+from graspd.service.readers.files import open_shards
+from graspd.service.store.published_sets import SETS, fetch_wheel, read_members
+from graspd.service.store.store import open_store
+from graspd.worker.hands.load import load_hand
+from graspd.worker.objects.shapes import CLASSES
+from graspd.worker.rendering.pictures import grasp_pictures
+from graspd.worker.rendering.sheets import contact_sheet
+from graspd.worker.stages.assets import load_hand_files, prepared_object
+
+SPECS: Final = Path(__file__).parents[1] / "examples" / "objects"
+SCENES: Final = ("free", "table")
+#: Package of the published hands, and their files.
+GRIPPERS: Final = "robosuite/models/assets/grippers/"
+#: Object whose rate others are compared with, and its number of grasps per hand.
+MUG, MUG_GRASPS = "mug", 64
+#: Objects of one dataset; a run that ends early has whole parts with all hands.
+PART: Final = 20
+SHOWN, EDGE, WORST = 40, 176, 10
+_POLL_S, _PATIENCE_S = 5.0, 900.0
+
+
+@dataclass
+class Kept:
+    """Measurements that a continued run needs from earlier ones."""
+
+    seconds: float = 0.0
+    workers_killed: int = 0
+    service_killed: int = 0
+    peak_bytes: int = 0
+    add_s: float = 0.0
+    fetched: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, file: Path) -> Kept:
+        return cls(**json.loads(file.read_text())) if file.is_file() else cls()
+
+    def save(self, file: Path) -> None:
+        file.write_text(json.dumps(asdict(self)))
+
+
+def main(
+    work: Annotated[Path, typer.Option(help="Folder of the service and of the run's state.")],
+    out: Annotated[Path, typer.Option(help="Page to write.")] = Path("docs", "results", "objects.md"),
+    name: Annotated[str, typer.Option("--set", help="Name of the published set.")] = "pybullet-random",
+    objects: Annotated[int, typer.Option(help="Number of objects, drawn at random; 0: all.")] = 100,
+    grasps: Annotated[int, typer.Option(help="Valid grasps of each hand, object and scene.")] = 32,
+    hands: Annotated[
+        str, typer.Option(help="Names of hands, comma-separated.")
+    ] = "allegro,barrett,shadow,robotiq-3f,inspire",
+    scenes: Annotated[str, typer.Option(help="free, table or both.")] = "free,table",
+    workers: Annotated[int, typer.Option(help="Workers of the service.")] = 2,
+    kill_minutes: Annotated[float, typer.Option(help="Minutes between two kills of a worker.")] = 6.0,
+    minutes: Annotated[float, typer.Option(help="Write the page after this time, even if work remains.")] = math.inf,
+) -> None:
+    """Run the datasets and write the page; the same command continues."""
+    work.mkdir(parents=True, exist_ok=True)
+    end, began = time.monotonic() + 60 * minutes, time.monotonic()
+    run = ExecutionContext(work, {k: v for k, v in os.environ.items() if not k.startswith("GRASPD_")}, workers=workers)
+    kept, state = Kept.load(work / "run.json"), work / "run.json"
+    run.up()
+    try:
+        if not kept.fetched:
+            kept.fetched = run.graspd("objects", "fetch", name, "--count", str(objects))
+            kept.add_s = time.monotonic() - began
+            kept.save(state)
+        add_hands(run, hands.split(","))
+        shapes = {one["name"]: one for one in kept.fetched["objects"] if one["verdict"] != "refuse"}
+        drawn = random.Random(0).sample(sorted(shapes), len(shapes))
+        parts = [drawn[start : start + PART] for start in range(0, len(drawn), PART)]
+        create = Create(hands, scenes.split(","))
+        follow(run, create.commands("mug", [MUG], MUG_GRASPS), kept, end=end)
+        done: list[str] = []
+        for number, part in enumerate(parts):
+            wanted = create.commands(f"part-{number}", part, grasps)
+            follow(run, wanted, kept, end=end, kill_s=60 * kill_minutes)
+            done += part
+            kept.save(state)
+            if time.monotonic() > end:
+                break
+        # Its cells are those of the parts, so nothing is made again.
+        wanted = create.commands(f"objects-{len(done)}", done, grasps)
+        follow(run, wanted, kept, end=end)
+        found = {one: list(run.client().cells(one)) for one in (*wanted, *create.commands("mug", [MUG], MUG_GRASPS))}
+        timings = index_timings(run, list(wanted), work)
+        sheet = out.with_suffix(".webp")
+        draw_sheet(run, list(wanted), shapes, sheet)
+    finally:
+        run.stop()
+    command = f"--set {name} --objects {objects} --grasps {grasps} --hands {hands} --scenes {scenes}"
+    out.write_text(page(found, shapes, kept, timings, command, sheet.name, data=work / "data"))
+    typer.echo(out.read_text())
+
+
+@dataclass(frozen=True)
+class Create:
+    hands: str
+    scenes: Sequence[str]
+
+    def commands(self, name: str, objects: Sequence[str], grasps: int) -> dict[str, Sequence[str]]:
+        """Return the command that makes a dataset of each scene, by its name."""
+        return {
+            f"{name}-{scene}": (
+                *("datasets", "create", f"{name}-{scene}", "--spec", str(SPECS / f"{scene}.toml"), "--yes"),
+                *("--hands", self.hands, "--objects", ",".join(objects), "--grasps", str(grasps)),
+            )
+            for scene in self.scenes
+        }
+
+
+def add_hands(run: ExecutionContext, wanted: Sequence[str]) -> None:
+    """Add the published hands among those wanted from their package."""
+    known = {asset.name for asset in run.client().assets(AssetKind.HAND)}
+    entries = [one for one in HANDS if one.name in wanted and one.path.startswith(GRIPPERS) and one.name not in known]
+    if not entries:
+        return
+    package = SETS["robosuite"]
+    files = read_members(fetch_wheel(package.package, package.version, package.sha256), GRIPPERS + r".+[^/]")
+    for name, data in files.items():
+        (file := run.folder / "hands" / name).parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(data)
+    for one in entries:
+        path = str(run.folder / "hands" / one.path)
+        run.graspd(
+            "hands", "add", path, "--name", one.name, "--licence", package.licence, "--no-self-test", "--no-wait"
+        )
+        typer.echo(run.client().wait_for_check(AssetKind.HAND, one.name, timeout_s=_PATIENCE_S).message)
+
+
+def follow(
+    run: ExecutionContext, wanted: dict[str, Sequence[str]], kept: Kept, *, end: float, kill_s: float = math.inf
+) -> None:
+    """Create the datasets and wait until they end or time is up; kill a worker every `kill_s`, and all at a third."""
+    for command in wanted.values():
+        run.graspd(*command)
+    last, killed, said = time.monotonic(), time.monotonic(), -1.0
+    while True:
+        now = time.monotonic()
+        kept.seconds, last = kept.seconds + (now - last) * math.isfinite(kill_s), now
+        kept.peak_bytes = max(kept.peak_bytes, memory_bytes(run.processes[0]))
+        views = [run.client().dataset(name) for name in wanted]
+        done, tasks = sum(view.tasks_done for view in views), sum(view.tasks for view in views)
+        if done / max(1, tasks) > said + 0.02:
+            said = done / max(1, tasks)
+            valid = ", ".join(f"{view.name} {view.valid} of {view.candidates}" for view in views)
+            typer.echo(f"{time.strftime('%H:%M:%S')} {100 * said:.0f} % {valid}")
+            kept.save(run.folder / "run.json")
+        if all(view.state.is_final for view in views) or now > end:
+            return
+        if math.isfinite(kill_s) and said > 1 / 3 and not kept.service_killed:
+            kept.service_killed += 1
+            os.killpg(run.processes[0], signal.SIGKILL)
+            os.waitpid(run.processes[0], 0)
+            run.up()
+            for command in wanted.values():
+                run.graspd(*command)
+        if now > killed + kill_s:
+            killed = now
+            workers = run.client().send("GET", "/v1/workers").json()
+            busy = [one["pid"] for one in workers if one["state"] == "busy"]
+            with suppress(ProcessLookupError, IndexError):
+                os.kill(random.choice(busy), signal.SIGKILL)
+                kept.workers_killed += 1
+        time.sleep(_POLL_S)
+
+
+def memory_bytes(root: int) -> int:
+    """Return the proportional memory of a process and its descendants."""
+    parent = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            parent[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
+    family = {root}
+    while more := {pid for pid, above in parent.items() if above in family} - family:
+        family |= more
+    total = 0
+    for pid in family:
+        with suppress(OSError):
+            lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+            total += sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+    return total
+
+
+def index_timings(run: ExecutionContext, datasets: Sequence[str], work: Path) -> dict[str, float]:
+    """Return times of a page of grasps, of the facets of the grasps' page, and of a snapshot and a card [s]."""
+
+    def time_of(action: Callable[[], Any], repeats: int = 5) -> float:
+        times = []
+        for _ in range(repeats):
+            began = time.monotonic()
+            action()
+            times.append(time.monotonic() - began)
+        return float(np.median(times))
+
+    client, first = run.client(), datasets[0]
+    found = {
+        "page of 50 grasps": time_of(lambda: client.send("GET", "/v1/grasps", params={"limit": 50})),
+        "dashboard page of grasps with its facets": time_of(lambda: client.send("GET", f"/grasps?dataset={first}")),
+    }
+    for name in datasets:
+        run.graspd("datasets", "snapshot", name)
+    card = ("datasets", "card", first, "--data-dir", str(work / "data"), "-o", str(work / "card"))
+    found["card"] = time_of(lambda: run.graspd(*card), 1)
+    return found
+
+
+def draw_sheet(run: ExecutionContext, datasets: Sequence[str], shapes: dict[str, Any], file: Path) -> None:
+    """Draw random report objects, each with its best valid grasp by epsilon, as one sheet of WebP; hands take turns."""
+    url = f"file://{run.folder / 'data' / 'store'}"
+    held: dict[str, dict[str, tuple[float, Any, Any]]] = defaultdict(dict)
+    for dataset in datasets:
+        for hand in sorted({one.hand for one in open_shards(url, dataset=dataset).of_kind("base")}):
+            grasps = graspd.open(url, dataset=dataset, hand=hand)
+            epsilon = np.where(grasps.is_valid, np.nan_to_num(grasps.metric("epsilon"), nan=0.0), -1.0)
+            for name in np.unique(grasps.columns["object"]):
+                best = int(np.where(grasps.columns["object"] == name, epsilon, -2.0).argmax())
+                if epsilon[best] > held[str(name)].get(hand, (-1.0,))[0]:
+                    pose = (grasps.hand_pose[best], grasps.joint_positions[best])
+                    held[str(name)][hand] = (float(epsilon[best]), *pose)
+    report = [name for name in sorted(held) if held[name] and shapes[name]["shape"]["split"] == "report"]
+    drawn = sorted(random.Random(0).sample(report, min(SHOWN, len(report))))
+    digests = {kind: {one.name: one.digest for one in run.client().assets(kind)} for kind in AssetKind}
+    store, pictures, captions = open_store(url, make=False), [], []
+    hands: dict[str, Any] = {}
+    for number, name in enumerate(drawn):
+        hand = sorted(held[name])[number % len(held[name])]
+        if hand not in hands:
+            digest = digests[AssetKind.HAND][hand]
+            hands[hand] = load_hand(load_hand_files(store, digest), name=hand, digest=digest)
+        obj = prepared_object(store, digests[AssetKind.OBJECT][name], name=name, face_error_m=3e-4)
+        _, pose, joints = held[name][hand]
+        pictures.append(grasp_pictures(hands[hand], obj, pose[None], joints[None], (EDGE, EDGE), samples=8)[0, 0])
+        captions.append([(name.rpartition("-")[2], shapes[name]["shape"]["class"]), ("", hand)])
+    if pictures:
+        page = contact_sheet(np.array(pictures), captions, title="Report objects, best valid grasps", columns=8)
+        Image.open(io.BytesIO(page)).convert("RGB").save(file, quality=60, method=6)
+
+
+def page(
+    found: dict[str, list[CellView]],
+    shapes: dict[str, Any],
+    kept: Kept,
+    timings: dict[str, float],
+    command: str,
+    sheet: str,
+    data: Path,
+) -> str:
+    mine = {name.rpartition("-")[2]: cells for name, cells in found.items() if name.startswith("objects-")}
+    mug = {name.rpartition("-")[2]: cells for name, cells in found.items() if name.startswith("mug-")}
+    every = [cell for cells in mine.values() for cell in cells]
+    valid, spent = sum(cell.valid for cell in every), sum(cell.seconds for cell in every)
+    times = kept.fetched["check_s"]
+    rate, of_mug = valid / max(spent, 1e-9), mug_rate(mine, mug)
+    facts = {
+        "objects accepted": f"{kept.fetched['accepted']} of {len(kept.fetched['objects'])}",
+        "CPU time of a check": f"p50 {times['p50']} s, p99 {times['p99']} s, largest {times['largest']:.2f} s",
+        "fetch, check and addition to the service": duration(kept.add_s),
+        "valid grasps": f"{valid:,} of {sum(cell.candidates for cell in every):,} candidates",
+        "wall time": duration(kept.seconds),
+        "worker time": duration(spent),
+        "valid grasps per worker second": f"{rate:.2f}, {rate / of_mug:.0%} of the mug's {of_mug:.2f}"
+        if of_mug
+        else f"{rate:.2f}",
+        "workers killed": f"{kept.workers_killed}, and {kept.service_killed} time all processes",
+        "failed attempts, each repeated": str(sum(cell.attempts_failed for cell in every)),
+        "unfinished cells": f"{sum(not cell.state.is_final for cell in every)} of {len(every)}",
+        "peak memory of all processes": size(kept.peak_bytes),
+        "disk: shards; all data": f"{size(folder_bytes(data / 'store' / 'shards'))}; {size(folder_bytes(data))}",
+        **{f"index: {name}": f"{seconds:.2f} s" for name, seconds in timings.items()},
+    }
+    lines = [
+        "# A set of objects",
+        "",
+        f"`python -m benchmarks.object_run --work DIR {command}`",
+        "",
+        f"graspd {PACKAGE_VERSION}, {platform.machine()}, {available_cores()} CPU cores, {time.strftime('%Y-%m-%d')}. "
+        "Specs: [free](../../examples/objects/free.toml), [table](../../examples/objects/table.toml).",
+        "",
+        *table(("what", ""), facts.items()),
+        "",
+        f"![Report objects with their best grasps]({sheet})",
+        "",
+        "## Hands",
+        "",
+        "*1*, *all*: share of objects with at least one, and with all requested valid grasps. *Worst tenth*: mean "
+        "share of valid candidates over the tenth of objects with the lowest. *Time*: worker seconds per valid grasp, "
+        "and in brackets for the mug. Only finished cells count.",
+        "",
+        *table(
+            ("hand", "scene", "split", "objects", "valid / candidates", "yield", "1", "all", "worst tenth", "time"),
+            (
+                (hand, scene, split, *figures(chosen), cost(chosen, [one for one in mug[scene] if one.hand == hand]))
+                for scene, cells in mine.items()
+                for hand in dict.fromkeys(one.hand for one in cells)
+                for split in ("train", "report")
+                if (chosen := ended(cells, shapes, hand=hand, split=split))
+            ),
+        ),
+        "",
+        "## Shape classes",
+        "",
+        *table(
+            ("class", "scene", "cells", "valid / candidates", "yield", "1", "all", "worst tenth"),
+            (
+                (kind, scene, *figures(chosen))
+                for kind in CLASSES
+                for scene, cells in mine.items()
+                if (chosen := ended(cells, shapes, **{"class": kind}))
+            ),
+        ),
+        "",
+        "## Refusals and repairs",
+        "",
+        *table(
+            ("objects", ""),
+            [
+                *((str(n), f"refused: {kind}") for kind, n in kept.fetched["refused"].items()),
+                *((str(n), kind) for kind, n in sorted(kept.fetched["repairs"].items(), key=lambda item: -item[1])),
+            ],
+        ),
+        "",
+        "## Shortfalls",
+        "",
+        *table(
+            ("cells", "reason"),
+            [(str(n), kind) for kind, n in Counter(kind_of(one.reason) for one in every if one.reason).most_common(12)],
+        ),
+        "",
+        f"The {WORST} objects with the lowest yield over all hands and scenes:",
+        "",
+        *table(("object", "class", "sides [mm]", "valid / candidates", "yield"), worst(every, shapes)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def ended(cells: Iterable[CellView], shapes: dict[str, Any], hand: str = "", **wanted: str) -> list[CellView]:
+    """Return the finished cells of a hand, if given, whose objects have the wanted facts of shape."""
+    finished = (one for one in cells if one.state.is_final and one.hand == (hand or one.hand))
+    return [one for one in finished if wanted.items() <= {**shapes[one.object]["shape"], "sides_m": 0}.items()]
+
+
+def yield_of(cells: Sequence[CellView]) -> float:
+    return sum(one.valid for one in cells) / max(1, sum(one.candidates for one in cells))
+
+
+def figures(cells: Sequence[CellView]) -> tuple[str, ...]:
+    """Return number of cells, grasps, yield, shares of cells with one and all grasps, and yield of the worst tenth."""
+    shares = sorted(one.valid / max(1, one.candidates) for one in cells)
+    return (
+        str(len(cells)),
+        f"{sum(one.valid for one in cells)} / {sum(one.candidates for one in cells)}",
+        f"{yield_of(cells):.2f}",
+        f"{np.mean([one.valid >= 1 for one in cells]):.2f}",
+        f"{np.mean([one.valid >= one.asked for one in cells]):.2f}",
+        f"{np.mean(shares[: -(-len(shares) // 10)]):.2f}",
+    )
+
+
+def cost(cells: Sequence[CellView], mug: Sequence[CellView]) -> str:
+    each = [sum(one.seconds for one in some) / max(1, sum(one.valid for one in some)) for some in (cells, mug)]
+    return f"{each[0]:.2f} ({each[1]:.2f})"
+
+
+def mug_rate(mine: dict[str, list[CellView]], mug: dict[str, list[CellView]]) -> float:
+    """Return the mug's valid grasps per worker second, for the same numbers of grasps of each hand and scene."""
+    grasps = seconds = 0.0
+    for scene, cells in mug.items():
+        for one in cells:
+            number = sum(other.valid for other in mine[scene] if other.hand == one.hand)
+            if one.valid:
+                grasps, seconds = grasps + number, seconds + number * one.seconds / one.valid
+    return grasps / seconds if seconds else 0.0
+
+
+def worst(cells: Sequence[CellView], shapes: dict[str, Any]) -> list[tuple[str, ...]]:
+    of: dict[str, list[CellView]] = defaultdict(list)
+    for one in cells:
+        if one.state.is_final:
+            of[one.object].append(one)
+    rows = []
+    for name in sorted(of, key=lambda name: yield_of(of[name]))[:WORST]:
+        facts, (_, made, share, *_) = shapes[name]["shape"], figures(of[name])
+        rows.append((name, facts["class"], " x ".join(f"{1e3 * side:.0f}" for side in facts["sides_m"]), made, share))
+    return rows
+
+
+def table(names: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(row)} |" for row in (names, ["---"] * len(names), *rows)]
+
+
+def folder_bytes(folder: Path) -> int:
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+if __name__ == "__main__":
+    typer.run(main)
