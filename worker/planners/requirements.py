@@ -27,7 +27,7 @@ from graspd.worker.objects.region import WHOLE, ContactRegion
 from graspd.worker.planners.fitting import region_points
 from graspd.worker.quality.diversity import hand_points as surface_points
 from graspd.worker.quality.grasp_type import RULES, Rule, pattern_of
-from graspd.worker.quality.probe import probe_of
+from graspd.worker.quality.probe import HAND_POINTS, probe_of
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.simulation.model import ANYWHERE, AllowedContacts
 from graspd.worker.simulation.obstacles import MARGIN_M, body_clearance
@@ -214,13 +214,18 @@ class Requirements:
     def fulfilled(
         self, hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps | None, device: str = "cpu"
     ) -> NDArray[np.bool_]:
-        """Return a mask (N,) of grasps of the whole hand with the required type, approach and wrist pose."""
+        """Return a mask (N,) of grasps of the whole hand with the required type, region, approach and wrist pose."""
         out = self._is_like(grasp)
         if (axes := self.axes(placed, len(grasp))) is not None:
             out &= _cosine(hand, grasp, axes) >= np.cos(self.cone)
-        if self.rule is not None:
-            probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64, device=device)
-            out &= self.rule.applies(pattern_of(hand, probe, probe.nearest_points(grasp, reach=_REACH_M)))
+        if self.rule is not None or not self.region.is_whole:
+            points = _POINTS if self.region.is_whole else HAND_POINTS
+            probe = probe_of(hand, obj, hand_points=points, object_points=64, device=device)
+            found = probe.nearest_points(grasp, reach=_REACH_M)
+            if self.rule is not None:
+                out &= self.rule.applies(pattern_of(hand, probe, found))
+            if not self.region.is_whole:
+                out &= probe.region_share(found, self.region) >= LEAST_SHARE
         return out
 
     def failed(
@@ -243,7 +248,7 @@ class Requirements:
             if self.type in TAXONOMY:
                 right = np.asarray(columns["quality/taxonomy_type"]) == TAXONOMY[self.type]
             elif self.rule.digits:
-                right &= (mask & 1 == 1) & (count_bits(mask) == self.rule.digits)
+                right &= (mask & 1 == 1) & (np.bitwise_count(mask) == self.rule.digits)
             out[~right] = "other_type"
         out[~self._is_like(grasp)] = "other_wrist_pose"
         return out
@@ -273,10 +278,6 @@ def _region(text: str, obj: ObjectModel | None, origin: Floats) -> Floats | Voxe
     half_spaces = np.array(spec.planes)
     half_spaces[:, 3] -= half_spaces[:, :3] @ origin
     return half_spaces
-
-
-def count_bits(numbers: NDArray[np.intp]) -> NDArray[np.intp]:
-    return (numbers[:, None] >> np.arange(8) & 1).sum(axis=1)
 
 
 def _reach_m(hand: HandModel) -> float:

@@ -20,7 +20,9 @@ from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.region import ContactRegion
 from graspd.worker.objects.topology import face_areas
+from graspd.worker.quality.contact import LINK_CONTACT_M
 from graspd.worker.simulation.device import DeviceHand, bounding_ball, posed_bodies, to_xyzw
 from graspd.worker.simulation.kernels import distance as kernels
 from graspd.worker.simulation.launches import launch
@@ -184,6 +186,12 @@ class Probe:
     def facing_mask(self, found: NearestPoints) -> NDArray[np.bool_]:
         """Return a mask (B, N) of points whose hand surface faces the object; other points cannot press."""
         return np.asarray(np.einsum("bni,bni->bn", found.hand_normals, found.normal) < FACING_COS)
+
+    def region_share(self, found: NearestPoints, region: ContactRegion) -> Floats:
+        """Return the share (B,) of the hand's surface in contact that touches the object in a region."""
+        area = np.where(np.abs(found.distance) < LINK_CONTACT_M, self.points.area, 0.0)
+        inside = np.where(region.contains(found.closest), area, 0.0).sum(axis=1)
+        return np.asarray(inside / np.maximum(area.sum(axis=1), 1e-12))
 
     def body_distance(self, found: Distances) -> Floats:
         """Return the least distance (B, L) [m] between each body and the object, from points of both."""

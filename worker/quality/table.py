@@ -24,7 +24,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.disk_cache import content_digest
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.region import WHOLE, ContactRegion
-from graspd.worker.quality.contact import LINK_CONTACT_M, MAX_CONTACTS, contact_area_cm2, contact_links, spread_contacts
+from graspd.worker.quality.contact import MAX_CONTACTS, contact_area_cm2, contact_links, spread_contacts
 from graspd.worker.quality.diversity import approach_cells
 from graspd.worker.quality.grasp_type import ContactPattern
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, probe_of
@@ -180,12 +180,6 @@ class _Chunk:
         epsilon, volume = measure_spaces(edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel())
         return epsilon.reshape(count.shape), volume.reshape(count.shape)
 
-    def region_share(self) -> Floats:
-        near = np.abs(self.found.distance) < LINK_CONTACT_M
-        area = np.where(near, self.pair.probe.points.area, 0.0)
-        inside = np.where(self.pair.region.contains(self.found.closest), area, 0.0).sum(axis=1)
-        return np.asarray(inside / np.maximum(area.sum(axis=1), 1e-12))
-
     def shared_volume(self) -> Floats:
         # A face may enter a piece between object points, but a point is within half a diagonal of their grid.
         near = self.found.piece_distance < self.pair.probe.sample_spacing
@@ -208,6 +202,6 @@ MEASURES: Final[dict[str, Callable[[_Chunk], NDArray[np.generic]]]] = {
     "grasp_type": lambda chunk: chunk.pattern.types,
     "taxonomy_type": lambda chunk: chunk.pattern.taxonomy(),
     "digits": lambda chunk: chunk.pattern.digits,
-    "region_share": _Chunk.region_share,
+    "region_share": lambda chunk: chunk.pair.probe.region_share(chunk.found, chunk.pair.region),
     "approach_cell": lambda chunk: approach_cells(chunk.pair.probe.hand, chunk.found.bodies[:, 0, 3:]),
 }

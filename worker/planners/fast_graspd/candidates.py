@@ -71,7 +71,6 @@ class Refinements:
 
 
 Seat = Callable[[Ints, Ints], Refinements]
-
 """Runs the fine phase for some grasps (n,), given the rows (n, each) of their starts."""
 
 RolloutOf = Callable[[GraspSet, Ints, Floats], Floats]

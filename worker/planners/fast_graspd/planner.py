@@ -360,14 +360,11 @@ def _optimise_part(launch: _Launch, begun: _Starts, beat: Floats | None = None) 
         order = candidates.rank_hands(merit + UNLIKE * unlike, n)[:, :last]
     fine_phase = _FinePhase(launch, rows, state, losses, curve)
     if batches.has_rollout:
-
-        def rollout(grasps: GraspSet, which: Rows, beat: Floats) -> Floats:
-            return batches.rollout(grasps, rows[which], beat)
-
         together = 1 if placed is None else candidates.TOGETHER
         device = pair.hand.device
         taken = candidates.select_by_rollout(
-            *(hand, obj, order, fine_phase.refine, placed, rollout),
+            *(hand, obj, order, fine_phase.refine, placed),
+            lambda grasps, which, beat: batches.rollout(grasps, rows[which], beat),
             beat=beat,
             unlike=unlike,
             together=together,
