@@ -243,7 +243,8 @@ class Requirements:
             if self.type in TAXONOMY:
                 right = np.asarray(columns["quality/taxonomy_type"]) == TAXONOMY[self.type]
             elif self.rule.digits:
-                right &= (mask & 1 == 1) & (count_bits(mask) == self.rule.digits)
+                count = (mask[:, None] >> np.arange(8) & 1).sum(axis=1)
+                right &= (mask & 1 == 1) & (count == self.rule.digits)
             out[~right] = "other_type"
         out[~self._is_like(grasp)] = "other_wrist_pose"
         return out
@@ -273,10 +274,6 @@ def _region(text: str, obj: ObjectModel | None, origin: Floats) -> Floats | Voxe
     half_spaces = np.array(spec.planes)
     half_spaces[:, 3] -= half_spaces[:, :3] @ origin
     return half_spaces
-
-
-def count_bits(numbers: NDArray[np.intp]) -> NDArray[np.intp]:
-    return (numbers[:, None] >> np.arange(8) & 1).sum(axis=1)
 
 
 def _reach_m(hand: HandModel) -> float:
