@@ -33,7 +33,6 @@ from graspd.service.model.errors import InputError
 from graspd.studies.engines import (
     compare_frictions,
     held_back_lines,
-    loss_kind,
     matrix_lines,
     plan_candidates,
     summarise_groups,
@@ -283,6 +282,16 @@ def with_section(page: str, section: str) -> str:
     first, *parts = (page or HEAD).split("\n## ")
     parts = [part for part in parts if part.partition("\n")[0] != section.partition("\n")[0].removeprefix("## ")]
     return "\n## ".join([first, *parts, section.removeprefix("## ")]).replace("\n\n\n", "\n\n")
+
+
+#: Kinds of losses, by the names of pushes and of lifts.
+_KINDS: Final = {"rotated": "turned", "turned": "turned", "displaced": "dropped", "not lifted": "dropped"}
+
+
+def loss_kind(reason: str) -> str:
+    """Return `turned`, `dropped`, or another reason without the direction of the push."""
+    name = reason.partition(" under ")[0]
+    return _KINDS.get(name, name)
 
 
 def cause_lines(engines: tuple[str, ...], found: Found) -> list[str]:

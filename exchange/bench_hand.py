@@ -9,21 +9,18 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
-from xml.etree.ElementTree import Element, SubElement
 
+import mujoco
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from graspd.exchange.imported import write_obj
+from graspd.exchange.robots.mujoco_scene import only_element, rename, restore_digits
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
-from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
+from graspd.worker.hands.model import HandModel
+from graspd.worker.validation.model import add_hand
 
-_DAMPING_TIME: Final = 0.02  # joint damping over position gain [s], as in DexGraspBench's Allegro hand
-#: Stiffness of couplings: larger than that of contacts, so that contacts do not stretch couplings.
-_COUPLING: Final = {"solref": "0.008 1", "solimp": "0.98 0.999 0.0001 0.5 2"}
-#: Least mass of a body [kg], and radius of the ball that is the inertia of a body without pieces [m].
-_BARE: Final = {"mass": 1e-3, "radius": 0.01}
 _COLOUR: Final = (0.87, 0.45, 0.2, 1.0)
 
 
@@ -31,10 +28,22 @@ def write_hand(hand: HandModel, config: str, root: Path) -> Path:
     """Write a hand's model and configuration file; return the model's path, relative to `root`."""
     folder = Path("assets") / "hand" / config
     (root / folder / "meshes").mkdir(parents=True, exist_ok=True)
+    spec = mujoco.MjSpec()
+    spec.modelname, spec.compiler.degree = hand.name, False
+    add_hand(spec, spec.worldbody.add_body(name="body0"), hand, {})
+    spec.compile()
+    tree = ElementTree.fromstring(spec.to_xml())
+    restore_digits(tree, spec)
+    only_element(tree, "compiler").set("meshdir", "meshes")
+    for mesh in tree.iter("mesh"):
+        mesh.set("file", f"{mesh.get('name')}.obj")
+        del mesh.attrib["vertex"]
     for number, piece in enumerate(hand.pieces):
         if piece.kind == "hull":
-            write_obj(root / folder / "meshes" / f"piece_{number:03}.obj", piece.vertices, piece.faces)
-    tree = _hand_model(hand)
+            write_obj(root / folder / "meshes" / f"hand{number}.obj", piece.vertices, piece.faces)
+    names = {f"body{b}": name for b, name in enumerate(body_names(hand))}
+    names |= {f"joint{b}": name for b, name in zip(hand.joint_body, hand.joint_names, strict=True)}
+    rename(tree, names | {f"dof{d}": name for d, name in enumerate(hand.dof_names)})
     ElementTree.indent(tree)
     (root / folder / "hand.xml").write_text(ElementTree.tostring(tree, encoding="unicode") + "\n")
     (root / "config" / "hand").mkdir(parents=True, exist_ok=True)
@@ -67,108 +76,6 @@ def _configuration(hand: HandModel, model: Path) -> str:
         "tip_body_name": [names[b] for b in hand.fingertips],
     }
     return "".join(f"{key}: {json.dumps(value)}\n" for key, value in values.items())
-
-
-def _hand_model(hand: HandModel) -> Element:
-    top = Element("mujoco", model=hand.name)
-    SubElement(top, "compiler", angle="radian", meshdir="meshes", autolimits="true")
-    assets, world = SubElement(top, "asset"), SubElement(top, "worldbody")
-    names, bodies = body_names(hand), list[Element]()
-    for b in range(hand.bodies):
-        if b == 0:
-            body = SubElement(world, "body", name=names[0])
-        else:
-            pose = hand.origin[b]
-            above = bodies[int(hand.parent[b])]
-            body = SubElement(above, "body", name=names[b], pos=_numbers_text(pose[:3]), quat=_numbers_text(pose[3:]))
-            _add_joint(body, hand, b)
-        bodies.append(body)
-        _add_solids(body, assets, hand, b)
-    contact = SubElement(top, "contact")
-    for a, b in sorted(hand.neighbours):
-        SubElement(contact, "exclude", body1=names[a], body2=names[b])
-    tendons = SubElement(top, "tendon") if hand.tendons else top
-    for tendon in hand.tendons:
-        fixed = SubElement(tendons, "fixed", name=tendon.name)
-        for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
-            SubElement(fixed, "joint", joint=hand.dof_names[d], coef=_numbers_text([pull]))
-    _add_drives(SubElement(top, "equality"), SubElement(top, "actuator"), hand)
-    return top
-
-
-def _joint_name(hand: HandModel, body: int) -> str:
-    return hand.joint_names[hand.joint_body.tolist().index(body)]
-
-
-def _add_joint(body: Element, hand: HandModel, b: int) -> None:
-    d, m, shift = int(hand.dof[b]), float(hand.multiplier[b]), float(hand.offset[b])
-    ends = sorted((m * float(hand.lower[d]) + shift, m * float(hand.upper[d]) + shift))
-    SubElement(
-        body,
-        "joint",
-        name=_joint_name(hand, b),
-        axis=_numbers_text(hand.axis[b]),
-        range=_numbers_text(ends),
-        type="hinge" if hand.joint_type[b] == JointType.REVOLUTE else "slide",
-        damping=_numbers_text([_DAMPING_TIME * float(hand.stiffness[d])]),
-    )
-
-
-def _add_solids(body: Element, assets: Element, hand: HandModel, b: int) -> None:
-    mass = max(float(hand.masses[b]), _BARE["mass"])
-    mine = [(number, piece) for number, piece in enumerate(hand.pieces) if piece.body == b]
-    if not mine:
-        inertia = 0.4 * mass * _BARE["radius"] ** 2
-        SubElement(body, "inertial", pos="0 0 0", mass=_numbers_text([mass]), diaginertia=_numbers_text([inertia] * 3))
-        return
-    share = np.array([float(np.prod(np.ptp(piece.vertices, axis=0))) for _, piece in mine])
-    for (number, piece), part in zip(mine, share / share.sum(), strict=True):
-        geom = SubElement(
-            body, "geom", {"mass": _numbers_text([mass * float(part)]), **_geom_attributes(piece, number)}
-        )
-        if piece.kind == "hull":
-            geom.set("mesh", f"piece_{number:03}")
-            SubElement(assets, "mesh", name=f"piece_{number:03}", file=f"piece_{number:03}.obj")
-
-
-def _geom_attributes(piece: ConvexPiece, number: int) -> dict[str, str]:
-    if piece.kind == "hull":
-        return {"name": f"piece_{number:03}", "type": "mesh"}
-    size = [0.5 * extent for extent in piece.size]
-    if piece.kind != "box":
-        # Radius, then half the length.
-        size = [piece.size[0], *(0.5 * length for length in piece.size[1:])]
-    place = {"pos": _numbers_text(piece.pose[:3]), "quat": _numbers_text(piece.pose[3:])}
-    return {"name": f"piece_{number:03}", "type": piece.kind, "size": _numbers_text(size), **place}
-
-
-def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
-    """Add position actuators for the first joint of each dof and for tendons; couple all other joints."""
-    pulled = {d: tendon for tendon in hand.tendons for d in tendon.dofs}
-    for d, name in enumerate(hand.dof_names):
-        if (tendon := pulled.get(d)) is not None:
-            if d == min(tendon.dofs):
-                gain, limit = tendon.gain(hand.stiffness), tendon.limit(hand.effort)
-                _add_actuator(actuators, name, {"tendon": tendon.name}, gain, limit)
-            continue
-        lead, *others = [int(b) for b in hand.joint_body if hand.dof[b] == d]
-        m = float(hand.multiplier[lead])
-        gain, limit = float(hand.stiffness[d]) / m**2, float(hand.effort[d]) / abs(m)
-        _add_actuator(actuators, name, {"joint": _joint_name(hand, lead)}, gain, limit)
-        for b in others:
-            ratio = float(hand.multiplier[b]) / m
-            start = float(hand.offset[b]) - ratio * float(hand.offset[lead])
-            pair = {"joint1": _joint_name(hand, b), "joint2": _joint_name(hand, lead)}
-            SubElement(equality, "joint", {**pair, "polycoef": _numbers_text([start, ratio, 0, 0, 0]), **_COUPLING})
-
-
-def _add_actuator(actuators: Element, name: str, driven: dict[str, str], gain: float, limit: float) -> None:
-    values = {"kp": _numbers_text([gain]), "forcerange": _numbers_text([-limit, limit])}
-    SubElement(actuators, "position", {"name": name, **driven, **values})
-
-
-def _numbers_text(values: Any) -> str:
-    return " ".join(f"{float(value):.12g}" for value in values)
 
 
 #: Folders of an experiment with grasps, and with grasps collected for training; the mapping is in the parent folder.

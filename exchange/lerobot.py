@@ -1,7 +1,7 @@
 """A LeRobot data set (v3.0): a grasp's trajectory as an episode, with a picture before the motion.
 
 docs/how-to/exchange/lerobot.md describes the features. A frame is a waypoint of the trajectory, from the standoff to
-the squeeze; `action` is the next frame's state, at the end the lift. The importer reads only exports of graspd."""
+the squeeze; `action` is the next frame's state, at the end the lift."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,18 +11,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.exchange.bench_scene import scenes_on_tables
 from graspd.exchange.huggingface import png
-from graspd.exchange.imported import ImportedGrasps, joints_by_name, parse_verdicts, scaled_object
 from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, group_by_scene
 from graspd.service import parquet
-from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
-from graspd.service.model.transforms import POSE_PARTS, Floats, compose, invert
+from graspd.service.model.transforms import POSE_PARTS, Floats, compose
 from graspd.service.readers import Pictures
 from graspd.service.readers.trajectories import trajectory_of
-from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.hands.load import hand_from_path
 
 VERSION: Final = "v3.0"
 FPS: Final = 10
@@ -215,87 +210,3 @@ def _statistics(values: NDArray[Any], *, picture: bool) -> dict[str, Any]:
     found |= {name: np.quantile(values, share, axis=0) for name, share in _QUANTILES.items()}
     shaped = {name: (one[:, None, None] if picture else one).tolist() for name, one in found.items()}
     return shaped | {"count": [len(values)]}
-
-
-_STOPS = 4  # number of postures at the end of a trajectory: pregrasp, grasp, squeeze, lift
-_LARGEST = 2**22  # largest size of `info.json` [bytes]
-
-
-def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read one object's grasps on tables, with approaches if all have the same number of waypoints.
-    Raises InputError: files are invalid or not from graspd, or `object_name` selects no single object."""
-    names = _read_joint_names(path)
-    task = _find_task(path, object_name)
-    ways, rest, numbers = _trajectories(path, task)
-    if not len(ways) or min(map(len, ways)) < _STOPS:
-        raise InputError(f"{path} has no episodes of task {task} with a complete trajectory")
-    model, thing = hand_from_path(hand), scaled_object(obj)
-
-    def posture(qpos: Floats) -> Posture:
-        pose = qpos[:, :7].copy()
-        # float32 quaternions deviate slightly from the unit sphere.
-        pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
-        return Posture(compose(invert(rest), pose), joints_by_name(model, names, qpos[:, 7:], what=str(path)))
-
-    pregrasp, grasp, squeeze, lift = (posture(np.array([way[k] for way in ways])) for k in range(-_STOPS, 0))
-    grasps = GraspSet(grasp, pregrasp, squeeze, np.full(len(ways), np.nan))
-    placed = scenes_on_tables(rest)
-    grasps.scene, grasps.lift = placed.index, lift
-    if len({len(way) for way in ways}) == 1 and len(ways[0]) > _STOPS:
-        coming = [posture(np.array([way[k] for way in ways])) for k in range(len(ways[0]) - _STOPS)]
-        grasps.approach = np.stack([at.hand_pose for at in coming], axis=1)
-        grasps.coming = coming[-1].joint_positions
-    return [ImportedGrasps(model, thing, grasps, object_name or thing.name, 1.0, _verdicts(path, numbers), placed)]
-
-
-def _read_joint_names(path: Path) -> list[str]:
-    file = path / "meta" / "info.json"
-    try:
-        with file.open("rb") as stream:
-            names = [str(name) for name in json.loads(stream.read(_LARGEST))["features"][STATE]["names"]]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{file} is no description of a LeRobot data set: {error_text(error)}") from None
-    if tuple(names[:7]) != POSE_PARTS:
-        raise InputError(f"{path} was not exported by graspd: its states do not begin with {', '.join(POSE_PARTS)}")
-    return names[7:]
-
-
-def _find_task(path: Path, object_name: str) -> int:
-    found = parquet.read(path / "meta" / "tasks.parquet", ("task", "task_index"))
-    words, numbers = found.get("task", []), found.get("task_index", [])
-    if not object_name and len(numbers) == 1:
-        return int(numbers[0])
-    if task_text(object_name) not in words:
-        raise InputError(f"{path} has the tasks {', '.join(map(str, words[:8]))}; select one object: --name")
-    return int(numbers[words.index(task_text(object_name))])
-
-
-def _trajectories(path: Path, task: int) -> tuple[list[Floats], Floats, list[int]]:
-    """Return postures (W, 7 + J), object pose and number of each of a task's episodes."""
-    ways, rest, numbers = list[Floats](), list[Floats](), list[int]()
-    wanted = (STATE, ACTION, OBJECT, EPISODE, "frame_index", "task_index")
-    for file in sorted((path / "data").glob("*/*.parquet")):
-        found: dict[str, Any] = parquet.read(file, wanted)
-        try:
-            episode, frame, kind = (np.asarray(found[name], np.int64) for name in wanted[3:])
-            for number in np.unique(episode[kind == task]):
-                rows = np.flatnonzero(episode == number)
-                rows = rows[np.argsort(frame[rows], kind="stable")]
-                way = [found[STATE][k] for k in rows] + [found[ACTION][rows[-1]]]
-                ways.append(np.array(way, float))
-                rest.append(np.array(found[OBJECT][rows[0]], float).reshape(7))
-                numbers.append(int(number))
-        except (KeyError, ValueError, TypeError) as error:
-            raise InputError(f"{file} is no file of frames from graspd: {error}") from None
-    place = np.array(rest).reshape(len(rest), 7)
-    place[:, 3:] /= np.maximum(np.linalg.norm(place[:, 3:], axis=1, keepdims=True), 1e-12)
-    return ways, place, numbers
-
-
-def _verdicts(path: Path, episodes: list[int]) -> NDArray[np.int8] | None:
-    found: dict[Any, Any] = {}
-    for file in sorted((path / "meta" / "episodes").glob("*/*.parquet")):
-        columns = parquet.read(file, (EPISODE, VERDICT))
-        if VERDICT in columns and EPISODE in columns:
-            found |= dict(zip(columns[EPISODE], columns[VERDICT], strict=True))
-    return parse_verdicts([found.get(number) for number in episodes]) if found else None

@@ -216,7 +216,8 @@ def results_table(result: dict[str, Any]) -> str:
     """Return the result of `bench` in Markdown."""
     rows = [
         [
-            *(r["fidelity"], _batch_text(r), r["processes"], f"{r['coarse_points']}, {r['hand_points']}", r["faces"]),
+            *(r["fidelity"], f"{r['join']} × {r['batch']}", r["processes"]),
+            *(f"{r['coarse_points']}, {r['hand_points']}", r["faces"]),
             *(r["iterations"], f"{r['ms_per_iteration']:.2f}", f"{r['grasps_per_second']:.1f}"),
             *(f"{100 * r['spread']:.0f} %", f"{r['peak_memory_mb']:.0f}"),
         ]
@@ -242,10 +243,6 @@ def results_table(result: dict[str, Any]) -> str:
     first, following = start["first_grasp_s"], start["next_grasp_s"]
     lines += ["", f"In a fresh process the first grasp takes {first:.2f} s, the next {following:.2f} s."]
     return "\n".join(lines)
-
-
-def _batch_text(run: dict[str, Any]) -> str:
-    return str(run["batch"]) if run["join"] == 1 else f"{run['join']} × {run['batch']}"
 
 
 def write(result: dict[str, Any], folder: Path) -> None:

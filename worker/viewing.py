@@ -18,6 +18,7 @@ from graspd.service.readers import trajectories
 from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.formats.glb import from_linear
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.probe import Probe, probe_of
 from graspd.worker.rendering.hands import drawn_parts, drawn_poses
@@ -49,7 +50,7 @@ class Models:
         self._mesh("/grasp/object/mesh", obj, _OBJECT)
         self.bodies: list[Any] = []
         for number, part in enumerate(drawn_parts(hand, mounted=mounted)):
-            colour = tuple(round(255 * _srgb(share)) for share in part.look.base)
+            colour = tuple(np.rint(255 * from_linear(np.array(part.look.base))).astype(int).tolist())
             self.bodies.append(self._mesh(f"/grasp/hand/{number}", part.solid, colour))
         self.contacts: Any = None
         self._around: list[Any] = []
@@ -114,10 +115,6 @@ def _set_pose(node: Any, pose: Floats) -> None:
 def _colours(distance: Floats) -> NDArray[np.uint8]:
     parts = [np.interp(distance, _STOPS, _COLOURS[:, k]) for k in range(3)]
     return np.stack(parts, axis=-1).astype(np.uint8)
-
-
-def _srgb(linear: float) -> float:
-    return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
 
 
 #: Distance of the first view from the object [m], and the angle between candidate views [rad].

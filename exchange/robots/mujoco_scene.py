@@ -36,7 +36,7 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
     spec = scene_spec(found.hand, found.obj, pieces, physics, *around)
     spec.modelname = f"{plain_name(found.hand.name)} and {plain_name(found.obj.name)}"
     tree = ElementTree.fromstring(spec.to_xml())
-    _restore_digits(tree, spec)
+    restore_digits(tree, spec)
     for geom in tree.iter("geom"):
         number = scene.model.geom(geom.attrib["name"]).id
         geom.set("user", number_text([scene.tip_geoms[number], scene.pressing[number]]))
@@ -58,7 +58,7 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
     return [file, script, *_write_arm(bundle, folder)]
 
 
-def _restore_digits(tree: Element, spec: Any) -> None:
+def restore_digits(tree: Element, spec: Any) -> None:
     """Write numbers with all digits, as differences below MuJoCo's six digits can change verdicts."""
     for tag in ("body", "joint", "geom", "mesh"):
         for element in tree.iter(tag):

@@ -21,13 +21,13 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.engines.mujoco_warnings import ARENA
 from graspd.worker.hands.collisions import collision_exempt_pairs
 from graspd.worker.hands.load import HandSource, body_model, files_from_path
-from graspd.worker.hands.model import HandModel, JointType
+from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.options import HandOptions
 from graspd.worker.hands.robot import FREE, MOVING, joint_chain
 from graspd.worker.hands.tree import build_tree
 from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation.decomposition import ConvexPieces
-from graspd.worker.validation.model import add_mesh, add_shape, add_support
+from graspd.worker.validation.model import add_bodies, add_mesh, add_support
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,7 @@ def arm_spec(arm: Arm, base: Floats) -> Any:
     spec.memory = ARENA
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     root = spec.worldbody.add_body(name="arm0", pos=base[:3], quat=base[3:])
-    bodies = _add_tree(spec, root, arm.model, "arm", _ARM)
+    bodies = add_bodies(spec, root, arm.model, _ARM, ("arm",) * 3)
     frame = bodies[arm.mount_body].add_body(name="flange", pos=arm.mount_pose[:3], quat=arm.mount_pose[3:])
     frame.add_site(name=MOUNT, pos=arm.hand_pose[:3], quat=arm.hand_pose[3:])
     for a, b in sorted(arm.model.neighbours):
@@ -272,7 +272,7 @@ class ArmScene:
         self.spec = arm_spec(arm, base)
         flange = self.spec.body("flange")
         root = flange.add_body(name="hand0", pos=arm.hand_pose[:3], quat=arm.hand_pose[3:])
-        _add_tree(self.spec, root, hand, "hand", _OTHER)
+        add_bodies(self.spec, root, hand, _OTHER, ("hand",) * 3)
         thing = self.spec.worldbody.add_body(name="object", mocap=True)
         for k, corners in enumerate(pieces.vertices):
             add_mesh(self.spec, thing.add_geom(**_OTHER), corners, f"object{k}")
@@ -325,29 +325,6 @@ class ArmScene:
             # The first link turns at the base, inside a support. Any other link inside a support means a wrong base.
             if times >= ALWAYS * SAMPLES and (a or model.body(b).name == "arm1"):
                 self.spec.add_exclude(bodyname1=model.body(a).name, bodyname2=model.body(b).name)
-
-
-def _add_tree(spec: Any, root: Any, model: HandModel, prefix: str, contact: dict[str, int]) -> list[Any]:
-    bodies = [root]
-    for b in range(1, model.bodies):
-        pose = model.origin[b]
-        body = bodies[model.parent[b]].add_body(name=f"{prefix}{b}", pos=pose[:3], quat=pose[3:])
-        turning = model.joint_type[b] == JointType.REVOLUTE
-        d, m, shift = int(model.dof[b]), float(model.multiplier[b]), float(model.offset[b])
-        ends = sorted((m * float(model.lower[d]) + shift, m * float(model.upper[d]) + shift))
-        body.add_joint(
-            name=f"{prefix}{b}",
-            type=mujoco.mjtJoint.mjJNT_HINGE if turning else mujoco.mjtJoint.mjJNT_SLIDE,
-            axis=model.axis[b],
-            range=ends,
-            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
-        )
-        # Nothing is simulated: any mass is valid.
-        body.mass, body.inertia, body.ipos, body.explicitinertial = 1.0, np.full(3, 1e-2), np.zeros(3), True
-        bodies.append(body)
-    for k, piece in enumerate(model.pieces):
-        add_shape(spec, bodies[piece.body].add_geom(**contact), piece, f"{prefix}_{k}")
-    return bodies
 
 
 def _joint_addresses(model: Any, tree: HandModel, prefix: str) -> NDArray[np.intp]:

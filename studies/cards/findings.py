@@ -74,7 +74,7 @@ def _yield_findings(card: Row) -> Iterator[str]:
     low = [cell for cell in rows if cell["of_validated"] < _LITTLE * median_high(yields[cell["hand"]])]
     if low:
         low.sort(key=lambda cell: cell["of_validated"])
-        each = _join_words([f"{_pair_name(cell)} ({_percent(cell['of_validated'])})" for cell in low])
+        each = _join_words([f"{_pair_name(cell)} ({percent(cell['of_validated'])})" for cell in low])
         yield (
             f"**Difficult pairs**, with less than half of the hand's median yield: {each}. Their valid grasps are "
             "biased towards easy ones."
@@ -107,7 +107,7 @@ def _recheck_findings(card: Row) -> Iterator[str]:
         ]
         yield (
             f"**Rechecks overturned {found['recheck_dropped']} of {found['rechecked']:,} verdicts** "
-            f"({_percent(rate['share'])}, 95 % {_percent(rate['low'])} to {_percent(rate['high'])}): "
+            f"({percent(rate['share'])}, 95 % {percent(rate['low'])} to {percent(rate['high'])}): "
             f"{_join_words(wrong)}."
         )
 
@@ -116,8 +116,8 @@ def _second_engine_findings(card: Row) -> Iterator[str]:
     found = card["validity"]
     if rate := found["second_held"]:
         yield (
-            f"**Second engine**: of {found['second_tested']:,} valid grasps, {_percent(rate['share'])} hold in all "
-            f"engines (95 % {_percent(rate['low'])} to {_percent(rate['high'])})."
+            f"**Second engine**: of {found['second_tested']:,} valid grasps, {percent(rate['share'])} hold in all "
+            f"engines (95 % {percent(rate['low'])} to {percent(rate['high'])})."
         )
 
 
@@ -126,17 +126,17 @@ def _table_findings(card: Row) -> Iterator[str]:
     if not found["grasps"]:
         return
     told = (
-        f"**{_percent(1 - found['of_grasps']['share'])} of the valid grasps are not clear of the table in any scene**: "
+        f"**{percent(1 - found['of_grasps']['share'])} of the valid grasps are not clear of the table in any scene**: "
         "grasps are planned around a free object, from all directions. "
-        f"{found['clear']:,} of {found['grasps']:,} are clear, in {_percent(found['of_pairs']['share'])} of all pairs."
+        f"{found['clear']:,} of {found['grasps']:,} are clear, in {percent(found['of_pairs']['share'])} of all pairs."
     )
     rows = {name: row["of_grasps"]["share"] for name, row in found["by_object"].items() if row["of_grasps"]}
     worst = sorted(rows, key=rows.__getitem__)[:3]
     if found["too_near"]:
-        why = [f"{_percent(count / found['pairs'])} to {what}" for what, count in found["too_near"].items()]
+        why = [f"{percent(count / found['pairs'])} to {what}" for what, count in found["too_near"].items()]
         told += f" Pairs that are too close: {', '.join(why)}."
     if len(rows) > 3:
-        told += f" Fewest clear grasps: {_join_words([f'{name} ({_percent(rows[name])})' for name in worst])}."
+        told += f" Fewest clear grasps: {_join_words([f'{name} ({percent(rows[name])})' for name in worst])}."
     yield told
     yield from _elevation_findings(card)
 
@@ -155,12 +155,12 @@ def _elevation_findings(card: Row) -> Iterator[str]:
     for what, chosen in (("10° of the horizontal", abs(middles) < 10), ("20° of the vertical", abs(middles) > 70)):
         found, expected = every[chosen].sum() / every.sum(), even[chosen].sum()
         if found > _PEAKED * expected:
-            said.append(f"{_percent(found)} approach within {what} ({_percent(expected)} under uniform directions)")
+            said.append(f"{percent(found)} approach within {what} ({percent(expected)} under uniform directions)")
     if said:
         yield f"**Preferred directions**: of all palms over the table, {' and '.join(said)}."
     if clear.sum():
         yield (
-            f"In {_percent(clear[middles > 45].sum() / clear.sum())} of the pairs that are clear of the table, the "
+            f"In {percent(clear[middles > 45].sum() / clear.sum())} of the pairs that are clear of the table, the "
             "palm approaches from 45° or more above the horizontal."
         )
 
@@ -178,17 +178,17 @@ def _direction_findings(card: Row) -> Iterator[str]:
         yield (
             f"Hands approach from nearly all directions, but not uniformly. Of {rows['cells']} directions of equal "
             f"area, at most {some[most]['empty']} are empty per object ({most}). By object, grasps are spread as if "
-            f"{_percent(low)} to {_percent(high)} of the directions were used uniformly."
+            f"{percent(low)} to {percent(high)} of the directions were used uniformly."
         )
 
 
 def _joint_findings(card: Row) -> Iterator[str]:
     for hand, joints in card["joints"].items():
-        still = [f"`{name}` ({_percent(use['used'])})" for name, use in joints.items() if use["used"] < _STILL]
+        still = [f"`{name}` ({percent(use['used'])})" for name, use in joints.items() if use["used"] < _STILL]
         if still:
             yield f"**{hand} hardly moves** {_join_words(still)} (share of the range that 98 % of the grasps use)."
         ends = [
-            f"`{name}` {end} ({_percent(use[f'at_{end}'])})"
+            f"`{name}` {end} ({percent(use[f'at_{end}'])})"
             for name, use in joints.items()
             for end in ("lower", "upper")
             if use[f"at_{end}"] > _AT_LIMIT and use["used"] >= _STILL
@@ -202,11 +202,11 @@ def _quality_findings(card: Row) -> Iterator[str]:
     for hand, found in card["quality"].items():
         parts = []
         if (epsilon := found.get("epsilon")) and epsilon["zero"] > 0.01:
-            parts.append(f"{_percent(epsilon['zero'])} have ε = 0 (no force closure at this contact threshold)")
+            parts.append(f"{percent(epsilon['zero'])} have ε = 0 (no force closure at this contact threshold)")
         if (depth := found.get("penetration_depth_mm")) and depth["p95"] > 1:
             parts.append(f"5 % penetrate deeper than {depth['p95']:.1f} mm")
         if (models := found.get("robust_share")) and models["median"] < 1:
-            share = _percent(models["median"])
+            share = percent(models["median"])
             parts.append(f"half of them hold in at most {share} of the models around the nominal one")
         if parts:
             said.append(f"{hand}: {'; '.join(parts)}")
@@ -244,5 +244,8 @@ def _join_words(words: Sequence[str]) -> str:
     return ", ".join(words[:_SHOWN]) + rest
 
 
-def _percent(value: float) -> str:
-    return f"{100 * value:.0f} %" if value >= 0.095 or value == 0 else f"{100 * value:.1f} %"
+def percent(value: float | None) -> str:
+    if value is None:
+        return "-"
+    digits = 0 if (value >= 0.1 and round(value, 3) < 0.995) or value in (0, 1) else 1
+    return f"{100 * value:.{digits}f} %"

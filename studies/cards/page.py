@@ -8,8 +8,9 @@ from typing import Any, Final
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from graspd.api.formatting import size
 from graspd.service.model.metrics import GRASP_METRICS
-from graspd.studies.cards.findings import findings
+from graspd.studies.cards.findings import findings, percent
 from graspd.studies.figures import markdown_table
 from graspd.worker.quality import gate as gates
 
@@ -181,22 +182,8 @@ def format_fixed(value: float | None, digits: int = 0) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def percent(value: float | None) -> str:
-    if value is None:
-        return "-"
-    digits = 0 if (value >= 0.1 and round(value, 3) < 0.995) or value in (0, 1) else 1
-    return f"{100 * value:.{digits}f} %"
-
-
 def _count(number: int, what: str = "") -> str:
     return f"{number:,} {what}{'' if number == 1 else 's'}" if what else f"{number:,}"
-
-
-def _size(count: int) -> str:
-    value, unit = float(count), 0
-    while value >= 1000 and unit < 4:
-        value, unit = value / 1000, unit + 1
-    return f"{value:.{0 if unit == 0 or value >= 100 else 1}f} {('B', 'kB', 'MB', 'GB', 'TB')[unit]}"
 
 
 def _rejected(rejected: Mapping[str, int] | None) -> str:
@@ -225,7 +212,7 @@ _ENVIRONMENT.filters |= {
     "millimetres": lambda extents: " x ".join(f"{1e3 * extent:.0f}" for extent in extents or ()) or "-",
     "percent": percent,
     "rejected": _rejected,
-    "size": _size,
+    "size": size,
 }
 _TEMPLATE: Final = _ENVIRONMENT.get_template("page.md.j2")
 _CROISSANT: Final = _ENVIRONMENT.get_template("croissant.json.j2")

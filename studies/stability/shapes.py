@@ -1,6 +1,6 @@
 """Stability studies: planners on difficult shapes (thin, sharp, open, tiny, huge), prepared like uploads."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, Final
@@ -27,12 +27,12 @@ MILLIMETRES: Final = 1e-3
 #: Text for maps of candidates: measure of a cell, bounds of bad values, and symptom for users.
 MEASURE: Final = "share of valid candidates (held by the validator and accepted by the geometric gate)"
 BOUNDS: Final = "weak: below 0.5; broken: 0, or a value that is not finite"
-SHOWS: Final = "few or no valid grasps; the job reports that its budget is used up"
-
-
-def plate_mesh(thickness_mm: float) -> Any:
-    """Return a plate of 80 x 60 mm."""
-    return trimesh.creation.box((0.08, 0.06, thickness_mm * MILLIMETRES))
+_SAID: Final[dict[str, Any]] = {
+    "x": "the shape's parameter",
+    "measure": MEASURE,
+    "bounds": BOUNDS,
+    "shows": "few or no valid grasps; the job reports that its budget is used up",
+}
 
 
 def wedge(angle_deg: float) -> Any:
@@ -60,20 +60,19 @@ def cube(side_mm: float) -> Any:
     return trimesh.creation.box(3 * (side_mm * MILLIMETRES,))
 
 
-def _half_inverted(faces: Any) -> Any:
-    faces[::2] = faces[::2, ::-1]
-    return faces
-
-
 def box_with_defect(name: str) -> Any:
     """Return a box with the named defect of `DEFECTS`."""
     mesh = trimesh.creation.box((0.07, 0.06, 0.05))
-    return trimesh.Trimesh(mesh.vertices, DEFECTS[name](mesh.faces.copy()), process=False)
+    return trimesh.Trimesh(mesh.vertices, DEFECTS[name](mesh.faces), process=False)
 
 
 #: Family -> unit of its parameter, constructor, parameters.
 FAMILIES: Final[dict[str, tuple[str, Callable[[float], Any], tuple[float, ...]]]] = {
-    "plate": ("thickness [mm]", plate_mesh, (0.2, 0.5, 1, 2, 5, 10)),
+    "plate": (
+        "thickness [mm]",
+        lambda mm: trimesh.creation.box((0.08, 0.06, mm * MILLIMETRES)),
+        (0.2, 0.5, 1, 2, 5, 10),
+    ),
     "wedge": ("angle of the edge [deg]", wedge, (5, 10, 20, 40, 80)),
     "ring": ("diameter of the hole [mm]", ring_mesh, (4, 8, 16, 32, 64)),
     "cross": ("depth of the corners [mm]", cross_mesh, (2, 5, 10, 20)),
@@ -85,7 +84,7 @@ DEFECTS: Final[dict[str, Callable[[Any], Any]]] = {
     "a side is missing": lambda faces: faces[2:],
     _ALLOW_OPEN: lambda faces: faces[2:],
     "inside out": lambda faces: faces[:, ::-1],
-    "every other face inside out": _half_inverted,
+    "every other face inside out": lambda faces: np.where(np.arange(len(faces))[:, None] % 2, faces, faces[:, ::-1]),
 }
 CLOSED: Final = tuple(name for name in DEFECTS if name != _ALLOW_OPEN)  # defects that ingest refuses or closes
 
@@ -103,32 +102,40 @@ class MapOptions:
 def shape_map(
     hand: HandModel, options: MapOptions, *, fidelities: Sequence[str], families: Sequence[str], defects: Sequence[str]
 ) -> StabilityMap:
-    jobs: list[tuple[str, float | str, Any]] = [
-        (f"{family}: {FAMILIES[family][0]}", value, FAMILIES[family][1](value))
-        for family in families
-        for value in FAMILIES[family][2]
-    ]
+    jobs = _jobs({family: FAMILIES[family][2] for family in families})
     jobs += [("mesh of a box", name, box_with_defect(name)) for name in defects]
-    cells = []
-    for (panel, value, mesh), fidelity in product(jobs, fidelities):
-        place, allow_open = (panel, value, fidelity), value == _ALLOW_OPEN
-        cell = shape_cell(hand, place, mesh, options, allow_open=allow_open, fidelity=fidelity)
-        options.say(f"{panel} {value} {fidelity}: {cell.outcome} {cell.value:.2f} {cell.note}")
-        cells.append(cell)
     return StabilityMap(
         "shapes",
         f"{options.count} grasps of {hand.name} on difficult shapes",
-        "the shape's parameter",
-        "fidelity",
-        MEASURE,
-        BOUNDS,
-        mark_reachable(cells, lambda cell: True),
-        SHOWS,
-        "ingest refuses meshes without an inside and reports `thin` walls; gate and validator reject grasps with "
+        y="fidelity",
+        cells=_cells(hand, jobs, options, "fidelity", fidelities),
+        guard="ingest refuses meshes without an inside and reports `thin` walls; gate and validator reject grasps with "
         "deep penetration; a job with too few valid grasps reports it",
-        "tests/studies/test_stability.py::test_a_shape_is_refused_or_its_grasps_are_sound",
+        guard_test="tests/studies/test_stability.py::test_a_shape_is_refused_or_its_grasps_are_sound",
         reach="all: uploaded objects can have such shapes",
+        **_SAID,
     )
+
+
+def _jobs(shapes: Mapping[str, Sequence[float]]) -> list[tuple[str, float | str, Any]]:
+    """Return panel, parameter and mesh of each shape; `shapes` has the parameters of each family."""
+    return [
+        (f"{family}: {FAMILIES[family][0]}", value, FAMILIES[family][1](value))
+        for family, values in shapes.items()
+        for value in values
+    ]
+
+
+def _cells(
+    hand: HandModel, jobs: Sequence[tuple[str, float | str, Any]], options: MapOptions, axis: str, values: Sequence[str]
+) -> list[MapCell]:
+    """Return the cells of all jobs for each fidelity or method, as `axis` says."""
+    cells = []
+    for (panel, x, mesh), y in product(jobs, values):
+        cell = shape_cell(hand, (panel, x, y), mesh, options, allow_open=x == _ALLOW_OPEN, **{axis: y})
+        options.say(f"{panel} {x} {y}: {cell.outcome} {cell.value:.2f} {cell.note}")
+        cells.append(cell)
+    return mark_reachable(cells, lambda cell: True)
 
 
 def prepare_mesh(mesh: Any, face_error_m: float, *, allow_open: bool = False) -> ObjectModel:
@@ -205,23 +212,13 @@ SHAPES: Final[dict[str, tuple[float, ...]]] = {
 def baseline_map(
     hand: HandModel, options: MapOptions, *, methods: Sequence[str], shapes: dict[str, tuple[float, ...]]
 ) -> StabilityMap:
-    cells = []
-    for family, values in shapes.items():
-        unit, make, _ = FAMILIES[family]
-        for value, method in product(values, methods):
-            cell = shape_cell(hand, (f"{family}: {unit}", value, method), make(value), options, method=method)
-            options.say(f"{family} {value:g} {method}: {cell.outcome} {cell.value:.2f} {cell.note}")
-            cells.append(cell)
     return StabilityMap(
         "baselines",
         f"{options.count} grasps of {hand.name} by each method on difficult shapes",
-        "the shape's parameter",
-        "method",
-        MEASURE,
-        BOUNDS,
-        mark_reachable(cells, lambda cell: True),
-        SHOWS,
-        "gate and validator reject bad grasps; a job with too few valid grasps reports it",
-        "tests/studies/test_stability.py::test_a_job_whose_every_grasp_is_bad_ends_with_none",
+        y="method",
+        cells=_cells(hand, _jobs(shapes), options, "method", methods),
+        guard="gate and validator reject bad grasps; a job with too few valid grasps reports it",
+        guard_test="tests/studies/test_stability.py::test_a_job_whose_every_grasp_is_bad_ends_with_none",
         reach="all: a job may use any method",
+        **_SAID,
     )

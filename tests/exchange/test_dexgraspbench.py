@@ -285,7 +285,7 @@ def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block, tmp_path
     monkeypatch.chdir(tmp_path)  # nothing may depend on where the export was written
     found = load(tmp_path, file, "graspd_allegro_hand_right")
     meshes = {found.model.mesh(number).name for number in range(found.model.nmesh)}
-    hulls = {f"{PREFIX}piece_{k:03}" for k, piece in enumerate(hand.pieces) if piece.kind == "hull"}
+    hulls = {f"{PREFIX}hand{k}" for k, piece in enumerate(hand.pieces) if piece.kind == "hull"}
     assert hulls and hulls <= meshes
 
 

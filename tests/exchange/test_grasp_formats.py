@@ -173,7 +173,7 @@ def test_verdicts_are_known_or_not_and_two_scales_are_two_objects() -> None:
     assert len({scaled_object("block", scale).digest for scale in (1.0, 0.5, 2.0)}) == 3
 
 
-#: Files of the block's grasps, and how they are rounded: by text of 12 digits, matrices, float32 [m, rad].
+#: Files of the block's grasps, and how they are rounded: by text of 12 digits or matrices [m, rad].
 @pytest.mark.parametrize(
     ("name", "files", "rounding"),
     [
@@ -181,17 +181,15 @@ def test_verdicts_are_known_or_not_and_two_scales_are_two_objects() -> None:
         ("dexlearn", "assets/grasp/graspd_tabletop_graspd_barrett/succ_collect/*/block", 1e-8),
         ("graspgen", "grasps/barrett", 1e-9),
         ("huggingface", "", 1e-9),
-        ("lerobot", "", 1e-6),
     ],
 )
 def test_grasps_of_a_training_format_come_back(name: str, files: str, rounding: float, exported, stored: Shard) -> None:
-    if name in ("huggingface", "lerobot"):
+    if name == "huggingface":
         pytest.importorskip("pyarrow")
     options, found = {"robot": "", "object_name": "block", "number": 0}, []
     for file in sorted(exported(name).glob(files)) if files else [exported(name)]:
         for back in read_sets(name, file, "barrett", "block", options):
             assert back.published is not None and (back.placed is None) == (name in ("dexgraspnet2", "graspgen"))
-            assert (back.grasps.approach is None) == (name != "lerobot")
             for k, pose in enumerate(back.grasps.grasp.hand_pose):
                 (row,) = np.flatnonzero(np.abs(stored["grasp/hand_pose"][:, :3] - pose[:3]).max(axis=1) < rounding)
                 found.append(int(row))
@@ -202,10 +200,6 @@ def test_grasps_of_a_training_format_come_back(name: str, files: str, rounding: 
                     assert abs(given.hand_pose[k, 3:] @ ours[3:]) == pytest.approx(1, abs=1e-6)
                     joints = stored[f"{what}/joint_positions"][row]
                     np.testing.assert_allclose(given.joint_positions[k], joints, atol=rounding)
-                if back.grasps.approach is not None:
-                    lift, way = stored["grasp/lift"][row], stored["grasp/approach"][row]
-                    np.testing.assert_allclose(back.grasps.approach[k, :, :3], way[:, :3], atol=rounding)
-                    np.testing.assert_allclose(back.grasps.lift.hand_pose[k, :3], lift[:3], atol=rounding)
                 if back.placed is not None:
                     rest = stored["scene/object_pose"][stored["grasp/scene_index"][row]]
                     there = back.placed.object_pose[back.placed.index[k]]

@@ -12,7 +12,6 @@ from itertools import chain
 from typing import Any, Final
 from xml.etree.ElementTree import Element
 
-import manifold3d
 import numpy as np
 
 from graspd.service.model.errors import HandError, MeshError
@@ -23,13 +22,10 @@ from graspd.service.store.body_files import SUFFIXES as SUFFIXES
 from graspd.service.store.library import UNPACKED_LIMIT_BYTES
 from graspd.service.store.mesh_files import find_mesh
 from graspd.worker.objects.formats import READERS, Soup, read_mesh
-from graspd.worker.objects.formats.soup import Part, check_soup, join_parts
-from graspd.worker.objects.mesh_geometry import from_manifold
+from graspd.worker.objects.formats.soup import Part, check_soup, join_parts, primitive
 from graspd.worker.objects.mjcf_source import HIDDEN_GROUP, MAX_BYTES, compile_model, mesh_of_geom
 from graspd.worker.objects.xml_document import parse_xml
 
-#: Segments of a circle in round primitives: chords stay within 0.13 % of the radius.
-_SEGMENTS: Final = 64
 _UNKNOWN: Final = np.full(3, np.nan)
 #: Mass [kg], centre of mass (3,) [m], and inertia (3, 3) about it [kg m^2], nan if not stated.
 _Inertial = tuple[float, Floats, Floats]
@@ -142,22 +138,7 @@ def _part(element: Element, matrix: Floats, files: Mapping[str, bytes], main: st
     if shape.tag not in keys:
         raise MeshError(f"{main}: geometry <{shape.tag[:40]}> is not read; use mesh, box, sphere, cylinder or capsule")
     sizes = [size for key in keys[shape.tag] for size in _floats(_value(shape, key, ""), 3 if key == "size" else 1)]
-    return (*_primitive(shape.tag, sizes), matrix, _UNKNOWN, (element.get("name", ""),))
-
-
-def _primitive(kind: str, sizes: list[float]) -> tuple[Floats, Any]:
-    """Return vertices and faces of a box (x, y, z), sphere (r), cylinder or capsule (r, length) [m]."""
-    if not all(0 < size < math.inf for size in sizes):
-        raise MeshError(f"a {kind} of size {sizes} m; sizes are positive")
-    if kind == "box":
-        return from_manifold(manifold3d.Manifold.cube(sizes, True))
-    if kind == "cylinder":
-        return from_manifold(manifold3d.Manifold.cylinder(sizes[1], sizes[0], sizes[0], _SEGMENTS, True))
-    ball = manifold3d.Manifold.sphere(sizes[0], _SEGMENTS)
-    if kind == "sphere":
-        return from_manifold(ball)
-    ends = [ball.translate((0, 0, side * sizes[1] / 2)) for side in (-1, 1)]
-    return from_manifold(manifold3d.Manifold.batch_hull(ends))
+    return (*primitive(shape.tag, sizes), matrix, _UNKNOWN, (element.get("name", ""),))
 
 
 def _pose(element: Element) -> Floats:
@@ -229,7 +210,7 @@ def _geom_part(model: Any, geom: int, matrix: Floats) -> Part:
         kind, size, matrix = "sphere", [1.0], matrix @ np.diag([*size, 1.0])
     # MuJoCo states half lengths.
     sizes = [2 * value for value in size] if kind == "box" else [size[0], *(2 * value for value in size[1:2])]
-    return (*_primitive(kind, sizes[:1] if kind == "sphere" else sizes), matrix, _UNKNOWN, name)
+    return (*primitive(kind, sizes[:1] if kind == "sphere" else sizes), matrix, _UNKNOWN, name)
 
 
 def _matrix(position: Any, rotation: Any) -> Floats:

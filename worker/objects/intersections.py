@@ -98,7 +98,7 @@ def unite_self_overlaps(vertices: Floats, faces: Indices) -> Mesh | None:
     pieces = None if whole is None else _split_recursively(whole, _HALVINGS)
     if pieces is None:
         return None
-    united = mesh_geometry.from_manifold(manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add))
+    united = topology.from_manifold(manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add))
     extent = float(np.ptp(vertices, axis=0).max())
     united = topology.drop_unused_vertices(*topology.merge_vertices(*united, 1e-9 * extent))
     left = intersecting_faces(*united) if topology.is_closed(united[1]) else None
@@ -112,7 +112,7 @@ def _split_recursively(piece: Any, halvings: int) -> list[Any] | None:
     """Cut a solid into parts that do not intersect themselves; None if this takes too many cuts."""
     parts: list[Any] = []
     for part in piece.decompose():
-        mesh = mesh_geometry.from_manifold(part)
+        mesh = topology.from_manifold(part)
         crossed = intersecting_faces(*mesh)
         if crossed is None or part.volume() <= 0:
             return None

@@ -101,11 +101,6 @@ def to_manifold(vertices: Floats, faces: Indices) -> Any | None:
     return None if solid.status() != manifold3d.Error.NoError or solid.is_empty() else solid
 
 
-def from_manifold(solid: Any) -> tuple[Floats, Indices]:
-    mesh = solid.to_mesh64()
-    return np.array(mesh.vert_properties, dtype=np.float64)[:, :3], np.array(mesh.tri_verts, dtype=np.int64)
-
-
 def unite(parts: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices]]) -> Any:
     """Unite closed outward meshes and subtract the holes (outward too).
     A part inside a hole is separate from the solid around the hole, and stays. A part without thickness is ignored."""

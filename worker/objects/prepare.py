@@ -314,7 +314,7 @@ def _simplify_by_manifold(original: ReferenceMesh, error_m: float) -> list[Mesh]
     if whole is None:
         return []
     for share in (0.9, 0.5, 0.2):
-        mesh = mesh_geometry.from_manifold(whole.simplify(share * error_m))
+        mesh = topology.from_manifold(whole.simplify(share * error_m))
         if len(mesh[1]) < len(original.faces) and original.is_matched_by(mesh) and original.is_within(mesh, error_m):
             return [mesh]
     return []

@@ -313,14 +313,14 @@ def _unite(
                 {"keep_largest": True},
             )
         best = united - mesh_geometry.union([piece for group in groups[1:] for piece in group])
-        return mesh.with_faces(*mesh_geometry.from_manifold(best), f"kept the largest of {len(groups)} components")
+        return mesh.with_faces(*topology.from_manifold(best), f"kept the largest of {len(groups)} components")
     if len(pieces) > 1:
         how = "lie apart" if len(groups) > 1 else f"touch or lie within {1e3 * JOINED_M:g} mm"
         mesh = replace(mesh, notes=(*mesh.notes, f"{len(pieces)} parts that {how} are one rigid body"))
     before = sum(signed_volume(*p) for p in positives) - sum(signed_volume(*p) for p in holes)
     # Parts that only share a face keep their volume when united, but their faces inside the solid are removed.
     if abs(united.volume() - before) > 1e-6 * before or len(pieces) < len(positives):
-        found = mesh_geometry.from_manifold(united)
+        found = topology.from_manifold(united)
         return mesh.with_faces(*found, f"united {len(parts)} touching or intersecting components")
     vertices, faces = topology.join_meshes(positives + [(corners, cavity[:, ::-1]) for corners, cavity in holes])
     return replace(mesh, vertices=vertices, faces=faces)

@@ -255,3 +255,8 @@ def _pair_half_edges(vertices: Floats, faces: Indices, edges: Indices, half: Ind
     if 2 * len(closing) != len(order):
         return []
     return [(int(half[order[k]]), int(half[order[k - 1]])) for k in closing]
+
+
+def from_manifold(solid: Any) -> tuple[Floats, Indices]:
+    mesh = solid.to_mesh64()
+    return np.array(mesh.vert_properties, dtype=np.float64)[:, :3], np.array(mesh.tri_verts, dtype=np.int64)

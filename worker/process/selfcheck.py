@@ -88,8 +88,8 @@ def _faceted_ball() -> ObjectModel:
     from manifold3d import Manifold
 
     from graspd.worker.objects.formats.bare import stl_bytes
-    from graspd.worker.objects.mesh_geometry import from_manifold
     from graspd.worker.objects.prepare import load_object
+    from graspd.worker.objects.topology import from_manifold
 
     mesh = stl_bytes(*from_manifold(Manifold.sphere(_RADIUS_M, 12)))
     return load_object({"ball.stl": mesh}, name="ball", digest="", face_error_m=0.0)

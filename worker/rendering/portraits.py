@@ -15,8 +15,9 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compos
 from graspd.worker.hands.closing import closing_posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.mesh_geometry import corner_normals, from_manifold
+from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.topology import from_manifold
 from graspd.worker.rendering import pictures, sheets
 from graspd.worker.rendering.cameras import intrinsics
 from graspd.worker.rendering.hands import drawn_bodies, hand_parts

@@ -6,7 +6,7 @@ neighbour's convex piece. An `Environment` is in the object frame, `Scenes` are 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
@@ -131,13 +131,13 @@ class PlacedGrasps:
     @cached_property
     def scenes(self) -> tuple[Environment, ...]:
         """The S scenes in the object frame."""
-        return tuple(
-            Environment(
-                (*(o.in_frame(pose) for o in self.supports), *self._neighbour_obstacles(number)),
-                quat_rotate(quat_conjugate(pose[3:]), UP),
-            )
-            for number, pose in enumerate(np.asarray(self.object_pose, float))
-        )
+        found = []
+        for number, pose in enumerate(np.asarray(self.object_pose, float)):
+            beside = zip(self.neighbours, self.relative_neighbour_poses(number), strict=True)
+            solids = (solid.moved(place) for neighbour, place in beside for solid in neighbour.solids)
+            obstacles = (*(support.in_frame(pose) for support in self.supports), *solids)
+            found.append(Environment(obstacles, quat_rotate(quat_conjugate(pose[3:]), UP)))
+        return tuple(found)
 
     @cached_property
     def fixed(self) -> str:
@@ -163,10 +163,6 @@ class PlacedGrasps:
         if not self.neighbours:
             return np.zeros((0, 7))
         return np.asarray(compose(invert(self.object_pose[scene]), np.asarray(self.neighbour_pose[scene], float)))
-
-    def _neighbour_obstacles(self, scene: int) -> Iterator[Obstacle]:
-        for neighbour, pose in zip(self.neighbours, self.relative_neighbour_poses(scene), strict=True):
-            yield from (solid.moved(pose) for solid in neighbour.solids)
 
     def take(self, rows: NDArray[np.intp] | slice) -> PlacedGrasps:
         taken = replace(self, index=self.index[rows])

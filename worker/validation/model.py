@@ -238,24 +238,43 @@ def _add_hand(spec: Any, hand: HandModel, friction: list[float], root: str) -> N
         )  # fmt: skip
     else:
         base = spec.worldbody.add_body(name="body0", mocap=True)
-    bodies = [base]
-    for b in range(1, hand.bodies):
-        body = bodies[hand.parent[b]].add_body(name=f"body{b}", pos=hand.origin[b, :3], quat=hand.origin[b, 3:])
-        _add_joint(body, hand, b)
-        bodies.append(body)
-    for b, body in enumerate(bodies):
-        _add_mass_and_geoms(spec, body, hand, b, friction)
+    add_hand(spec, base, hand, {"condim": 4, "friction": friction, "solimp": HAND_SOLIMP, "solref": HAND_SOLREF})
+
+
+def add_hand(spec: Any, base: Any, hand: HandModel, contact: dict[str, Any]) -> None:
+    """Add a hand with its drives below its root body `base`; `contact` has properties of all geoms.
+    Names: `body1` ..., `joint1` ..., `hand0` ... (geoms and their meshes), `dof0` ... (actuators and tendons)."""
+    add_bodies(spec, base, hand, contact)
     _add_actuators(spec, hand)
     for a, b in sorted(hand.neighbours):
         spec.add_exclude(bodyname1=f"body{a}", bodyname2=f"body{b}")
 
 
-def _add_joint(body: Any, hand: HandModel, b: int) -> None:
+def add_bodies(
+    spec: Any,
+    base: Any,
+    hand: HandModel,
+    contact: dict[str, Any],
+    names: tuple[str, str, str] = ("body", "joint", "hand"),
+) -> list[Any]:
+    """Add bodies, joints and geoms, whose names begin with `names`; return all bodies (L,)."""
+    bodies = [base]
+    for b in range(1, hand.bodies):
+        pose = hand.origin[b]
+        body = bodies[hand.parent[b]].add_body(name=f"{names[0]}{b}", pos=pose[:3], quat=pose[3:])
+        _add_joint(body, hand, b, f"{names[1]}{b}")
+        bodies.append(body)
+    for b, body in enumerate(bodies):
+        _add_mass_and_geoms(spec, body, hand, b, contact, names[2])
+    return bodies
+
+
+def _add_joint(body: Any, hand: HandModel, b: int, name: str) -> None:
     revolute = hand.joint_type[b] == JointType.REVOLUTE
     d, m, shift = int(hand.dof[b]), float(hand.multiplier[b]), float(hand.offset[b])
     ends = sorted((m * float(hand.lower[d]) + shift, m * float(hand.upper[d]) + shift))
     body.add_joint(
-        name=f"joint{b}",
+        name=name,
         type=mujoco.mjtJoint.mjJNT_HINGE if revolute else mujoco.mjtJoint.mjJNT_SLIDE,
         axis=hand.axis[b],
         range=ends,
@@ -276,7 +295,7 @@ def _joint_properties(hand: HandModel, b: int, d: int) -> dict[str, Any]:
     return found
 
 
-def _add_mass_and_geoms(spec: Any, body: Any, hand: HandModel, b: int, friction: list[float]) -> None:
+def _add_mass_and_geoms(spec: Any, body: Any, hand: HandModel, b: int, contact: dict[str, Any], name: str) -> None:
     mass = max(float(hand.masses[b]), _MIN_MASS)
     mine = [(i, p) for i, p in enumerate(hand.pieces) if p.body == b]
     if not mine:
@@ -286,15 +305,7 @@ def _add_mass_and_geoms(spec: Any, body: Any, hand: HandModel, b: int, friction:
         return
     share = np.array([float(np.prod(np.ptp(p.vertices, axis=0))) for _, p in mine])
     for (i, p), part in zip(mine, share / share.sum(), strict=True):
-        geom = body.add_geom(
-            condim=4,
-            friction=friction,
-            solimp=HAND_SOLIMP,
-            solref=HAND_SOLREF,
-            mass=mass * float(part),
-            name=f"hand{i}",
-        )
-        add_shape(spec, geom, p, f"hand{i}")
+        add_shape(spec, body.add_geom(**contact, mass=mass * float(part), name=f"{name}{i}"), p, f"{name}{i}")
 
 
 def add_shape(spec: Any, geom: Any, piece: ConvexPiece, name: str) -> None:

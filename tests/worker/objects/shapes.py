@@ -6,7 +6,7 @@ from manifold3d import Manifold
 from numpy.typing import NDArray
 
 from graspd.worker.objects.formats.bare import stl_bytes
-from graspd.worker.objects.mesh_geometry import from_manifold
+from graspd.worker.objects.topology import from_manifold
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 

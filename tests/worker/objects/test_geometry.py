@@ -13,7 +13,7 @@ from graspd.service.model.errors import MeshError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.assets import builtin_files, builtin_names
 from graspd.worker.grasps import GRID_M, GraspSet, Posture
-from graspd.worker.objects import mesh_geometry
+from graspd.worker.objects import mesh_geometry, topology
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts
 from graspd.worker.objects.distance import MeshDistance, deviation, point_triangle_distance, sample_faces
@@ -112,7 +112,7 @@ def test_simplification_is_monotone_and_exact_at_zero() -> None:
     vertices, faces = sphere(segments=128)
     same = simplify(vertices, faces, 0.0)
     assert same[0] is vertices and same[1] is faces and same[2] == 0.0
-    vertices, faces = mesh_geometry.from_manifold(Manifold.cube((0.06, 0.05, 0.04), True).refine_to_length(0.002))
+    vertices, faces = topology.from_manifold(Manifold.cube((0.06, 0.05, 0.04), True).refine_to_length(0.002))
     assert len(faces) > 5000
     assert len(simplify(vertices, faces, 1e-5)[1]) < 100
 

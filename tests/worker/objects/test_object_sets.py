@@ -16,10 +16,10 @@ from graspd.service.model.errors import InputError, LimitError
 from graspd.service.model.object_options import ObjectOptions
 from graspd.service.store import published_sets
 from graspd.service.store.published_sets import SETS, PublishedSet, fetch_wheel, read_members
-from graspd.worker.objects.mesh_geometry import from_manifold
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import build_model, repaired_mesh
 from graspd.worker.objects.shapes import shape_facts
+from graspd.worker.objects.topology import from_manifold
 from tests.worker.objects.shapes import Mesh, box, cylinder, stl
 
 BODY = '<robot name="b"><link name="l"><inertial><mass value="0.1"/></inertial><visual><geometry>'

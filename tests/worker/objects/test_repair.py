@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from graspd.commands.objects import report_object
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.intersections import intersecting_faces, unite_self_overlaps
-from graspd.worker.objects.mesh_geometry import from_manifold, signed_volume
+from graspd.worker.objects.mesh_geometry import signed_volume
 from graspd.worker.objects.prepare import load_object
-from graspd.worker.objects.topology import is_closed
+from graspd.worker.objects.topology import from_manifold, is_closed
 from tests.worker.objects.shapes import Mesh, box, cylinder, join, sphere, stl
 
 #: Uploads are float32: seven digits of 0.1 m.

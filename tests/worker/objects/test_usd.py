@@ -71,7 +71,7 @@ def test_frame_is_the_stages_in_metres() -> None:
     ],
 )
 def test_primitives_are_solids(prim: str, size: tuple[float, ...], volume: float) -> None:
-    """Chords of 64 sections lose 0.2 % of a circle's area, an icosphere and a capsule at most 2 % of their volume."""
+    """Chords of 64 sections lose 0.2 % of a circle's area, a sphere and a capsule at most 2 % of their volume."""
     obj = load_object({"g.usda": thing(prim)}, name="g", digest="", face_error_m=0)
     assert np.allclose(np.ptp(obj.vertices, axis=0), np.array(size) * 0.01, rtol=2e-3)
     assert np.allclose(obj.vertices.max(axis=0), -obj.vertices.min(axis=0), rtol=2e-3, atol=1e-6)

@@ -29,7 +29,6 @@ from graspd.worker.validation.protocol import MAX_DISPLACEMENT_M, STAGE_S, Test
 from graspd.worker.validation.robust import validate_robustness
 from graspd.worker.validation.validator import KnownRollouts, validate
 from graspd.worker.validation.variant import (
-    NOMINAL,
     Models,
     Variant,
     VariantLift,
@@ -261,7 +260,7 @@ def models(friction: tuple[float, float] = FRICTION) -> Models:
 def test_nominal_model_has_verdicts_of_the_lift_test_bit_for_bit(level: str) -> None:
     verdicts = validate_lifts(HAND, BOX, MANY, WHERE, level=level, pieces=WHOLE)  # type: ignore[arg-type]
     published = level == "dexgraspbench"
-    found = [models().lift(MANY, row, WHERE, NOMINAL, dexgraspbench=published) for row in range(len(MANY))]
+    found = [models().lift(MANY, row, WHERE, Variant(), dexgraspbench=published) for row in range(len(MANY))]
     assert [rollout.outcome for rollout in found] == verdicts.outcome.tolist()
     assert [rollout.margin for rollout in found] == verdicts.margin.tolist()
     assert {0, 1} == set(verdicts.success.tolist())
@@ -306,7 +305,9 @@ def test_an_object_that_stands_off_slides_and_the_hand_stays() -> None:
 def test_neighbours_stand_beside_the_object_in_every_model() -> None:
     placed = beside((0.0, 0.1), (0.03, 0.03, 0.05)).placed
     around = Models(HAND, BOX, WHOLE, MujocoOptions(), placed.supports, placed.neighbours)
-    assert all(around.scene(one).neighbours for one in (NOMINAL, Variant(grown_m=1e-3), Variant(centre_m=(0, 1e-3, 0))))
+    assert all(
+        around.scene(one).neighbours for one in (Variant(), Variant(grown_m=1e-3), Variant(centre_m=(0, 1e-3, 0)))
+    )
     found = around.lift(grasp(0.05), 0, placed, Variant(object_shift_m=(0.001, 0, 0)))
     assert found.outcome is LiftOutcome.LIFTED
 

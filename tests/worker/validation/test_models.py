@@ -32,7 +32,6 @@ from graspd.worker.validation.refit import applicable_fits, offset_piece, refit_
 from graspd.worker.validation.robust import Robustness, draw_models, required_model_count, validate_robustness
 from graspd.worker.validation.validator import validate
 from graspd.worker.validation.variant import (
-    NOMINAL,
     Models,
     Variant,
     VariantTest,
@@ -64,7 +63,7 @@ def by_luck(monkeypatch: pytest.MonkeyPatch, odds: float = 0.7) -> None:
 
 
 def test_in_models_that_are_all_same_grasp_holds_in_all_or_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robustness, "draw_variant", lambda axis, hand, rng: NOMINAL)
+    monkeypatch.setattr(robustness, "draw_variant", lambda axis, hand, rng: Variant())
     grasps = many_grasps()
     found = validate_robustness(PADS, BOX, grasps, models=3, pieces=WHOLE)
     verdicts = validate(PADS, BOX, grasps, pieces=WHOLE)
@@ -138,7 +137,7 @@ def test_models_of_a_grasp_are_its_own_and_the_nominal_one_is_validated_alike() 
     axes = [axis for axis, _ in draw_models(PADS, grasps, 0, 8, 0)]
     assert sorted(axes) == sorted(axes_of(PADS)) and len(axes) == 8
     verdicts = validate(PADS, BOX, grasps, pieces=WHOLE)
-    found = [models().standard(grasps, row, NOMINAL) for row in range(len(grasps))]
+    found = [models().standard(grasps, row, Variant()) for row in range(len(grasps))]
     assert [rollout.success for rollout in found] == (verdicts.success == 1).tolist()
     assert [rollout.margin for rollout in found] == verdicts.margin.tolist()
     assert {True, False} == set((verdicts.success == 1).tolist())
@@ -175,7 +174,7 @@ def test_shapes_grow_by_a_millimetre_in_the_engine(kind: str, monkeypatch: pytes
     # Whether plates are a gripper's jaws takes a search and moves no distance.
     monkeypatch.setattr(model, "jaws_of", lambda hand: None)
     around = models(finger(kind))
-    own = gap(around, NOMINAL)
+    own = gap(around, Variant())
     for by in (1e-3, -1e-3):
         # The engine's distances are good to its tolerance of 1e-6; corners of meshes are single precision.
         assert own - gap(around, Variant(grown_m=by)) == pytest.approx(by, abs=3e-6)
@@ -230,7 +229,7 @@ def test_fits_that_change_nothing_are_not_offered() -> None:
 
 def test_variants_reach_engine_and_leave_nominal_model_as_it_was() -> None:
     around = models()
-    own = around.scene(NOMINAL).model
+    own = around.scene(Variant()).model
     scene = around.scene(Variant(armature=3e-4, dry_friction=0.02, damping=0.5, gain=2.0, friction=0.75, mass=1.5))
     other, thing = scene.model, scene.object_body
     fingers = other.jnt_dofadr[[other.joint("joint1").id, other.joint("joint2").id]]
@@ -245,10 +244,10 @@ def test_variants_reach_engine_and_leave_nominal_model_as_it_was() -> None:
     assert other.body_inertia[thing] == pytest.approx(1.5 * own.body_inertia[thing])
     # Contacts are as stiff as inverse masses say.
     assert other.body_invweight0[thing, 0] == pytest.approx(own.body_invweight0[thing, 0] / 1.5)
-    before = copy.copy(around.scene(NOMINAL).model)
+    before = copy.copy(around.scene(Variant()).model)
     for axis in axes_of(PADS):
         around.scene(draw_variant(axis, PADS, np.random.default_rng(1)))
-    after = around.scene(NOMINAL).model
+    after = around.scene(Variant()).model
     for name in ("dof_damping", "dof_armature", "actuator_gainprm", "geom_friction", "body_mass", "geom_size"):
         assert np.array_equal(getattr(before, name), getattr(after, name)), name
 
@@ -257,7 +256,7 @@ def test_a_heavier_object_is_pushed_by_its_weight() -> None:
     around, away = models(), posture(((0, 0, -0.5), (0.0, 0.0)))
     grasps = GraspSet(away, away, away, np.full(1, np.nan))
     moved = []
-    for variant in (NOMINAL, Variant(mass=2.0)):
+    for variant in (Variant(), Variant(mass=2.0)):
         test = VariantTest(around.scene(variant), variant, None)
         test._close(grasps, 0)
         test._push(2)
@@ -299,7 +298,7 @@ def test_object_or_a_hand_that_is_off_is_met_the_other_way_round() -> None:
 def test_fingers_that_close_one_after_another_end_together() -> None:
     grasps, around = many_grasps(), models()
     variant = Variant(lags=(0.0, 0.25))
-    plain = list(VariantTest(around.scene(NOMINAL), NOMINAL, None)._way(grasps, 0))
+    plain = list(VariantTest(around.scene(Variant()), Variant(), None)._way(grasps, 0))
     late = list(VariantTest(around.scene(variant), variant, around._lags(variant))._way(grasps, 0))
     assert len(late) == len(plain) == 2 * STAGES
     assert late[-1][1] == pytest.approx(grasps.squeeze.joint_positions[0])
@@ -316,7 +315,7 @@ def test_a_compliant_coupling_gives_way_under_load() -> None:
     ) and PerturbedParameter.COUPLINGS not in axes_of(two_finger_hand())
     apart = []
     around = models(on_one_dof(two_finger_hand()))
-    for variant in (NOMINAL, Variant(coupling="compliant")):
+    for variant in (Variant(), Variant(coupling="compliant")):
         scene = around.scene(variant)
         data = placed_data(scene, np.zeros(2))
         data.qfrc_applied[scene.model.joint("joint2").dofadr[0]] = 0.5
@@ -356,7 +355,7 @@ def pressed(variant: Variant) -> tuple[float, float]:
 
 def test_each_reading_moves_as_it_says() -> None:
     assert variants.couplings_of(tied()) == ("separate", "ratio")
-    first, second = pressed(NOMINAL)
+    first, second = pressed(Variant())
     # A tendon holds the sum alone: the first joint runs to its limit, which gives some mrad, and the sum gives
     # 0.5 N m over 1 / (1 / 10 + 1 / 6) = 3.75 N m/rad.
     assert (first, second) == pytest.approx((-0.3, 0.4 + 0.5 / 3.75 + 0.3), abs=0.02)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, TypeVar
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from graspd.service.model.contact_region import is_part_name
 from graspd.service.model.errors import LimitError, MeshError
 from graspd.service.model.transforms import Floats
-from graspd.worker.objects.topology import face_vectors, join_meshes
+from graspd.worker.objects.topology import face_vectors, from_manifold, join_meshes
 
 MAX_FACES: Final = 1_000_000
 #: Largest plausible coordinate in any unit.
@@ -182,3 +183,24 @@ def _project_to_plane(points: Floats, normal: Floats) -> Floats:
     across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     across /= np.linalg.norm(across)
     return np.stack([points @ across, points @ np.cross(axis, across)], axis=1)
+
+
+#: Segments of a circle in round primitives: chords stay within 0.13 % of the radius.
+_SEGMENTS: Final = 64
+
+
+def primitive(kind: str, sizes: Sequence[float]) -> tuple[Floats, Ints]:
+    """Return vertices and faces of a box (x, y, z), sphere (r), or cylinder, capsule or cone (r, length).
+    The length is along z, that of a capsule without its caps. Raises MeshError: a size is not positive."""
+    if not all(0 < size < math.inf for size in sizes):
+        raise MeshError(f"a {kind} of size {sizes}; sizes are positive")
+    if kind == "box":
+        return from_manifold(manifold3d.Manifold.cube(sizes, True))
+    if kind in ("cylinder", "cone"):
+        end = sizes[0] if kind == "cylinder" else 0.0
+        return from_manifold(manifold3d.Manifold.cylinder(sizes[1], sizes[0], end, _SEGMENTS, True))
+    ball = manifold3d.Manifold.sphere(sizes[0], _SEGMENTS)
+    if kind == "sphere":
+        return from_manifold(ball)
+    ends = [ball.translate((0, 0, side * sizes[1] / 2)) for side in (-1, 1)]
+    return from_manifold(manifold3d.Manifold.batch_hull(ends))

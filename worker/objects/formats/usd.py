@@ -25,7 +25,7 @@ from graspd.service.store.assets import pack, unpack
 from graspd.service.store.usd_layers import LAYERS, PACKAGE, import_usd
 from graspd.service.store.usd_layers import SUFFIXES as SUFFIXES
 from graspd.worker.objects.formats.glb import from_linear
-from graspd.worker.objects.formats.soup import FaceNames, Soup, check_face_count
+from graspd.worker.objects.formats.soup import FaceNames, Soup, check_face_count, primitive
 from graspd.worker.objects.isolation import run_isolated
 
 #: First bytes of text, crate and package files.
@@ -149,26 +149,12 @@ def _read_packed(packed: bytes, main: str) -> Stage:
 
 def _primitive(shape: Mapping[str, Any]) -> tuple[Floats, Ints]:
     """Return vertices and triangles of a primitive in its own frame."""
-    from trimesh import creation  # slow to load
-
-    sizes = shape["size"]
-    if not all(0 < size < np.inf for size in sizes):
-        raise MeshError(f"{shape['path']}: a {shape['kind']} of size {sizes}; sizes are positive")
-    match shape["kind"]:
-        case "Cube":
-            made = creation.box(sizes * 3)
-        case "Sphere":
-            made = creation.icosphere(4, sizes[0])
-        case "Cylinder":
-            made = creation.cylinder(sizes[0], sizes[1], sections=64)
-        case "Capsule":
-            made = creation.capsule(sizes[1], sizes[0], count=[32, 32])
-        case _:
-            made = creation.cone(sizes[0], sizes[1], sections=64)
-    vertices = np.asarray(made.vertices, float)
-    # The library puts the base of a cone on the origin; USD centres all solids.
-    vertices[:, 2] -= (vertices[:, 2].max() + vertices[:, 2].min()) / 2
-    return vertices @ axis_rotation(shape).T, np.asarray(made.faces, np.int64)
+    kind, sizes = ("box", shape["size"] * 3) if shape["kind"] == "Cube" else (shape["kind"].lower(), shape["size"])
+    try:
+        vertices, faces = primitive(kind, sizes)
+    except MeshError as error:
+        raise MeshError(f"{shape['path']}: {error}") from None
+    return vertices @ axis_rotation(shape).T, faces
 
 
 def axis_rotation(shape: Mapping[str, Any]) -> Floats:

@@ -1,4 +1,7 @@
-"""Drake on the CPU (Tedrake et al. 2019): convex contact with lagged friction (Castro et al. 2023)."""
+"""Drake on the CPU (Tedrake et al. 2019): convex contact with lagged friction (Castro et al. 2023), steps of 8 ms.
+
+Contacts are hydroelastic patches on supports and with at most two drives. All others are one point per pair of shapes,
+without torsional friction."""
 
 from __future__ import annotations
 
@@ -42,25 +45,9 @@ _ROOT_AXES: Final = ((0, 0), (0, 1), (0, 2), (1, 2), (1, 1), (1, 0))  # (turning
 _ORIGIN: Final = RigidTransform()
 
 
-class DrakeEngine:
-    """Adapter of Drake."""
-
-    name = "drake"
-    contact_model = (
-        "Drake, SAP solver with lagged Coulomb friction; hydroelastic patches on supports and with at most two drives, "
-        "otherwise one point per pair of shapes without torsional friction; 8 ms"
-    )
-
-    def limitations(self, model: EngineModel) -> list[str]:
-        """Return what Drake cannot simulate in a model."""
-        return ["dry friction of joints"] if any(link.dry_friction for link in model.links) else []
-
-    def simulation(self, model: EngineModel) -> DrakeSimulation:
-        """Build a model."""
-        return DrakeSimulation(model)
-
-
-ENGINE: Final = DrakeEngine()
+def limitations(model: EngineModel) -> list[str]:
+    """Return what Drake cannot simulate in a model."""
+    return ["dry friction of joints"] if any(link.dry_friction for link in model.links) else []
 
 
 class DrakeSimulation:
@@ -218,6 +205,9 @@ class DrakeSimulation:
         """Add a shape; two shapes touch over an area if both are hydroelastic and one of them is soft."""
         name = f"shape{self._plant.num_collision_geometries()}"
         self._plant.RegisterCollisionGeometry(body, pose, shape, name, surface)
+
+
+simulation = DrakeSimulation
 
 
 def _is_simple(drive: Drive) -> bool:

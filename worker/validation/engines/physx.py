@@ -1,4 +1,6 @@
-"""PhysX 5 on the CPU, through SAPIEN (Xiang et al. 2020); the hand has reduced coordinates."""
+"""PhysX 5 on the CPU, through SAPIEN (Xiang et al. 2020): TGS solver, steps of 4 ms, hand in reduced coordinates.
+
+Contacts are rigid, with patch friction and torsional friction."""
 
 from __future__ import annotations
 
@@ -37,27 +39,12 @@ _RAILS: Final = ("x", "y", "z")
 HEAVY_KG: Final = 1e6  # inertia of the root's commanded motion
 
 
-class PhysxEngine:
-    """Adapter of PhysX."""
-
-    name = "physx"
-    contact_model = "PhysX 5: TGS solver, rigid contacts, patch friction with torsion; steps of 4 ms"
-
-    def limitations(self, model: EngineModel) -> list[str]:
-        """Return what PhysX cannot simulate in a model."""
-        found = []
-        if any(link.dry_friction for link in model.links):
-            found.append("dry friction of joints")
-        if len(_cliques(model.ignored)) > _GROUPS:
-            found.append(f"more than {_GROUPS} groups of links without contact")
-        return found
-
-    def simulation(self, model: EngineModel) -> PhysxSimulation:
-        """Build a model."""
-        return PhysxSimulation(model)
-
-
-ENGINE: Final = PhysxEngine()
+def limitations(model: EngineModel) -> list[str]:
+    """Return what PhysX cannot simulate in a model."""
+    found = ["dry friction of joints"] if any(link.dry_friction for link in model.links) else []
+    if len(_cliques(model.ignored)) > _GROUPS:
+        found.append(f"more than {_GROUPS} groups of links without contact")
+    return found
 
 
 class PhysxSimulation:
@@ -231,6 +218,8 @@ class PhysxSimulation:
         shape.local_pose = pose
         return self._filtered(shape, groups)
 
+
+simulation = PhysxSimulation
 
 _X_TO_Z: Final = sapien.Pose([0, 0, 0], [np.sqrt(0.5), 0, -np.sqrt(0.5), 0])  # round shapes lie along x in PhysX
 

@@ -75,7 +75,7 @@ class EngineModel:
     obj: RigidObject
     friction: float  # Coulomb coefficient of all contacts, static and dynamic
     torsional_friction_m: float
-    """Torque about a contact's normal per normal force [m]; an engine without it says so in its `contact_model`."""
+    """Torque about a contact's normal per normal force [m]; an engine without it says so in its module."""
     supports: tuple[Obstacle, ...] = ()  # fixed half-spaces (no corners) and convex solids, in the world frame
 
 
@@ -131,13 +131,10 @@ class Simulation(Protocol):
 
 
 class Engine(Protocol):
-    """Adapter of one engine; its module imports the engine only when it is used."""
-
-    name: str
-    contact_model: str  # one line: solver, contact and friction model, time step
+    """Module of one engine, imported only when it is used. It states solver, contact and friction model, time step."""
 
     def limitations(self, model: EngineModel) -> Sequence[str]:
         """Return what this engine cannot simulate in a model, each as a short noun phrase; empty if nothing."""
 
     def simulation(self, model: EngineModel) -> Simulation:
-        """Build a model. Raises InputError: the engine is not installed, with the extra to install."""
+        """Build a model."""

@@ -1,12 +1,12 @@
 """Engines by name, and verdicts on grasps in one of them or in several.
 
-The module of an engine has its name and a constant `ENGINE`; MuJoCo is part of the validator."""
+The module of an engine has its name; MuJoCo is part of the validator."""
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,12 +51,11 @@ def check_engines(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def load_engine(name: str) -> Engine:
-    """Return the adapter of an engine other than MuJoCo. Raises InputError: it is not installed."""
+    """Return the module of an engine other than MuJoCo. Raises InputError: it is not installed."""
     try:
-        engine: Engine = import_module(f"{__package__}.{name}").ENGINE
+        return cast(Engine, import_module(f"{__package__}.{name}"))
     except ModuleNotFoundError as error:
         raise InputError(f"engine {name} needs {error.name}; run pip install 'graspd[{name}]'") from None
-    return engine
 
 
 def validate_with_engine(
