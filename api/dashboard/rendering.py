@@ -62,7 +62,7 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
     context |= {
         "template": template,
         "path": request.url.path,
-        "query": {key: value for key, value in request.query_params.items() if value and key not in _NO_FILTERS},
+        "filters": {key: value for key, value in request.query_params.items() if value and key not in _NO_FILTERS},
         "base_url": base_url(request),
         "docs_url": request.app.state.settings.docs_url,
         "navigation": NAVIGATION if may_read else (),
