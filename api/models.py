@@ -289,17 +289,6 @@ class Worker(WorkerView):
     lease_age_s: float | None = Field(None, description="time since its last heartbeat [s]; null once it is gone")
 
 
-class Histogram(BaseModel):
-    """Distribution of one metric over the grasps of a job, or over a sample of about 20,000."""
-
-    metric: str
-    count: int
-    mean: float
-    low: float
-    high: float
-    counts: list[int] = Field(description="counts in equal bins from low to high")
-
-
 def stage_state(stage: StageProgress) -> State:
     """Return the state of a stage from the states of its tasks."""
     if stage.succeeded == stage.tasks:

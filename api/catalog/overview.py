@@ -87,12 +87,12 @@ class Overview:
     def stats(self) -> Stats:
         return self._services.index.overview.stats(scope=project_scope())
 
-    def valid_per_minute(self) -> list[int]:
-        """Return the numbers of valid grasps made in each of the last `MINUTES`, oldest first."""
+    def valid_per_minute(self) -> dict[str, int]:
+        """Return the numbers of valid grasps made in each of the last `MINUTES`, by minute (UTC), oldest first."""
         start = datetime.now(UTC) - timedelta(minutes=MINUTES - 1)
         minutes = [f"{start + timedelta(minutes=minute):%Y-%m-%dT%H:%M}" for minute in range(MINUTES)]
         made = self._services.index.overview.valid_per_minute(since=minutes[0], scope=project_scope())
-        return [made.get(minute, 0) for minute in minutes]
+        return dict.fromkeys(minutes, 0) | made
 
     def failures(self) -> list[FailureGroup]:
         return self._services.index.overview.failures(limit=_FAILURES_SHOWN, scope=project_scope())

@@ -8,19 +8,18 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from pydantic import ValidationError
 from starlette.datastructures import FormData
 
-from graspd.api.access.auth import ForeignResource
 from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.datasets import Datasets
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.dashboard import figures
-from graspd.api.dashboard.figures import paired_bars
 from graspd.api.dashboard.form_uploads import asset_choices
 from graspd.api.dashboard.forms import fields_of, first_message, inputs_of, split_list
 from graspd.api.dashboard.grasp_pages import COLUMNS
+from graspd.api.dashboard.job_list import change_jobs
 from graspd.api.dashboard.rendering import redirect, render
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, DatasetsOf, JobsOf
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.errors import ConflictError, InputError
+from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import OFFERED
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.spec import DatasetRequest
@@ -30,7 +29,6 @@ PAGE_SIZE: Final = 20
 MATRIX_CELLS: Final = 1000
 _CELLS_AT_ONCE: Final = 200
 Fields = Annotated[FormData, fields_of(4000)]
-_DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled"}
 
 _INPUTS: Final = inputs_of(cells=True)
 _MAKE: Final = {"name": "", "grasps": "320", "fidelity": "standard"} | {one.name: one.default for one in _INPUTS}
@@ -69,13 +67,13 @@ def act_on_pairs(
     try:
         if action == "submit":
             options = {key: str(fields[key]) for key in ("grasps", "fidelity") if fields.get(key)}
-            wanted = [JobRequest.model_validate(options | {"hand": hand, "object": obj}) for hand, obj in pairs]
-            done, left = _apply_to_each(jobs.submit, wanted)
+            filled = [options | {"hand": hand, "object": obj} for hand, obj in pairs]
+            wanted: list[Any] = [JobRequest.model_validate(one) for one in filled]
         else:
-            done, left = _apply_to_each(_job_action(jobs, action), _jobs_of(jobs, pairs, action))
+            wanted = _jobs_of(jobs, pairs, action)
+        return change_jobs(jobs, action, wanted, "/datasets", ("submit", "retry", "cancel"))
     except (ValidationError, InputError) as error:
         return _render_datasets(request, datasets, assets, problem=first_message(error), status=422)
-    return redirect("/datasets", _summary(action, done, left))
 
 
 @router.get("/{name}", dependencies=READ)
@@ -108,9 +106,7 @@ def dataset_page(
 
 @router.post("/{name}/cells", dependencies=SUBMIT)
 def act_on_cells(name: str, jobs: JobsOf, fields: Fields) -> RedirectResponse:
-    action = str(fields.get("action", ""))
-    done, left = _apply_to_each(_job_action(jobs, action), [str(cell) for cell in fields.getlist("cell")])
-    return redirect(f"/datasets/{name}", _summary(action, done, left))
+    return change_jobs(jobs, str(fields.get("action", "")), map(str, fields.getlist("cell")), f"/datasets/{name}")
 
 
 @router.post("/{name}/{action}", dependencies=SUBMIT)
@@ -127,13 +123,6 @@ def act(name: str, action: str, datasets: DatasetsOf) -> RedirectResponse:
     return redirect(f"/datasets/{name}", said)
 
 
-def _job_action(jobs: Jobs, action: str) -> Callable[[str], Any]:
-    do = {"retry": jobs.retry, "cancel": jobs.cancel}
-    if action not in do:
-        raise InputError(f"cells have no action {action!r}; they can be submitted, retried or cancelled")
-    return do[action]
-
-
 def _jobs_of(jobs: Jobs, pairs: Iterable[tuple[str, str]], action: str) -> list[str]:
     states = (State.FAILED, State.CANCELLED) if action == "retry" else (State.QUEUED, State.RUNNING)
     return [
@@ -142,23 +131,6 @@ def _jobs_of(jobs: Jobs, pairs: Iterable[tuple[str, str]], action: str) -> list[
         for state in states
         for job in jobs.page(state=state, hand=hand, object=obj, limit=_CELLS_AT_ONCE).items
     ]
-
-
-def _apply_to_each(do: Callable[[Any], Any], wanted: Iterable[Any]) -> tuple[int, int]:
-    """Apply an action; return the numbers of successes and of refusals (because of owner or state)."""
-    done = left = 0
-    for one in wanted:
-        try:
-            do(one)
-            done += 1
-        except (ConflictError, ForeignResource):
-            left += 1
-    return done, left
-
-
-def _summary(action: str, done: int, left: int) -> str:
-    unchanged = f"; {left} unchanged: owned by another key, or not in a suitable state" if left else ""
-    return f"{done} {'job' if done == 1 else 'jobs'} {_DONE[action]}{unchanged}."
 
 
 def _render_datasets(
@@ -210,5 +182,5 @@ def compare_page(request: Request, datasets: DatasetsOf, one: Named = "", other:
         names=[dataset.name for dataset in datasets.page(limit=_OFFERED).items],
         chosen=(one, other),
         found=found,
-        metrics=[(*shown[metric], both, paired_bars(both)) for metric, both in found.metrics.items()] if found else [],
+        metrics=[(*shown[metric], both) for metric, both in found.metrics.items()] if found else [],
     )

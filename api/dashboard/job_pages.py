@@ -11,8 +11,7 @@ from fastapi.responses import HTMLResponse
 from numpy.typing import NDArray
 from PIL import Image
 
-from graspd.api.dashboard import figures
-from graspd.api.dashboard.grasp_pages import COLUMNS, action_summary, tag_choices
+from graspd.api.dashboard.grasp_pages import COLUMNS, tag_choices
 from graspd.api.dashboard.rendering import render
 from graspd.api.models import GraspQuery, JobDetail
 from graspd.api.routes.dependencies import READ, GraspsOf, JobsOf, ShardsOf, TagsOf
@@ -51,14 +50,11 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         task_count=sum(stage.tasks for stage in job.stages),
         expected=jobs.estimate(job),
         cost=_cost_of(request.app.state.settings, job),
-        histograms=[
-            (*shown[data.metric], data, figures.histogram_bars(data, "/grasps", where))
-            for data in grasps.statistics(job)[0]
-        ],
+        histograms=[(*shown[name], name, data) for name, data in grasps.statistics(job)[0].items()],
+        where=where,
         pictures=pictures[:_SHOWN_PICTURES],
         picture_count=len(pictures),
         rows=rows,
-        did=action_summary(dict(request.query_params)),
         **tag_choices(tags, rows, tags.all(), where),
         all_said=f"all {'valid ' if validated else ''}grasps of this job",
         here=f"/jobs/{job_id}",

@@ -1,6 +1,5 @@
 """Pages of the service: home, workers, charts, failure maps, usage, deletions, problem types, session."""
 
-import time
 from collections import defaultdict
 from collections.abc import AsyncIterable
 from datetime import UTC, datetime, timedelta
@@ -14,7 +13,7 @@ from graspd.api.access.auth import SESSION_COOKIE, is_allowed
 from graspd.api.access.keys import SESSION_S, KeyFile, Scope
 from graspd.api.catalog import events
 from graspd.api.catalog.events import Webhooks
-from graspd.api.catalog.overview import MINUTES, Overview
+from graspd.api.catalog.overview import Overview
 from graspd.api.dashboard import (
     asset_pages,
     dataset_pages,
@@ -54,8 +53,6 @@ router = APIRouter(include_in_schema=False)
 def home(
     request: Request, overview: dependencies.OverviewOf, jobs: dependencies.JobsOf, datasets: dependencies.DatasetsOf
 ) -> HTMLResponse:
-    minutes = overview.valid_per_minute()
-    start = time.time() // 60 * 60 - 60 * (MINUTES - 1)
     return render(
         request,
         "home.html",
@@ -63,8 +60,7 @@ def home(
         events="/events",
         refresh_s=5,
         stats=overview.stats(),
-        minutes=minutes,
-        pace=figures.minute_bars(minutes, start),
+        minutes=overview.valid_per_minute(),
         jobs=jobs.page(limit=_JOBS),
         stages=stage_depths(overview),
         workers=[worker for worker in overview.workers() if is_recent(worker)],

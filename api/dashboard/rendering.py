@@ -31,7 +31,7 @@ NAVIGATION: Final = (
 #: Cookie with a message for the next page.
 _TOAST: Final = "graspd_toast"
 #: Parameters of pages that the API does not have.
-_NO_FILTERS: Final = ("view", "cursor", "did", "done", "named")
+_NO_FILTERS: Final = ("view", "cursor", "done")
 #: Cookie with the number of the last end of a job or dataset that the visitor has seen.
 SEEN: Final = "graspd_seen"
 MOST_UNREAD: Final = 100
