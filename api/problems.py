@@ -201,14 +201,7 @@ def install_handlers(app: FastAPI, page: Callable[[Request, dict[str, Any]], Res
     app.add_exception_handler(RequestValidationError, bad_request)
 
 
-def problem_responses(
-    *statuses: int, others: dict[int | str, dict[str, Any]] | None = None
-) -> dict[int | str, dict[str, Any]]:
-    """Return OpenAPI entries of a route: `others`, and a problem document for each status."""
-    return (others or {}) | {
-        status: {
-            "description": HTTPStatus(status).phrase,
-            "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
-        }
-        for status in statuses
-    }
+def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return OpenAPI entries of a route: a problem document for each status."""
+    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    return {status: {"description": HTTPStatus(status).phrase, "content": content} for status in statuses}

@@ -160,6 +160,7 @@ class RequestLimiter:
             self._waiting -= 1
 
 
+UNCHANGED: Final = "The file is unchanged: it has the tag of If-None-Match"
 _TAGS: Final = re.compile(r'\s*((?:W/)?"[^"]*")\s*(?:,|$)')
 
 
