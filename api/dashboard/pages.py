@@ -29,6 +29,7 @@ from graspd.api.dashboard.forms import FormEstimates
 from graspd.api.dashboard.job_pages import ShardPictures
 from graspd.api.dashboard.rendering import SEEN, environment, redirect, render, seen_end
 from graspd.api.models import STAGE_LABELS
+from graspd.api.problems import HTTP_PROBLEMS
 from graspd.api.routes import dependencies
 from graspd.api.routes.system import Since, Until
 from graspd.service.index.views import WorkerView
@@ -320,19 +321,8 @@ def explorer(request: Request) -> HTMLResponse:
 @router.get("/problems/{slug}")
 def problem_types(request: Request, slug: str = "") -> HTMLResponse:
     types = [(name, error.status, (error.__doc__ or "").splitlines()[0]) for name, error in ERRORS.items()]
-    types += _HTTP_PROBLEMS
+    types += [(slug, status, meaning) for status, (slug, meaning) in HTTP_PROBLEMS.items()]
     return render(request, "problems.html", types=sorted(types, key=lambda row: (row[1], row[0])))
-
-
-_HTTP_PROBLEMS: Final = (
-    ("bad-request", 400, "The body or form cannot be read."),
-    ("unauthorized", 401, "A valid key is required."),
-    ("forbidden", 403, "The scope of the key is insufficient, or the request comes from another web site."),
-    ("method-not-allowed", 405, "The address does not support this method."),
-    ("unsupported-media-type", 415, "The body is compressed or otherwise encoded; send it unencoded."),
-    ("range-not-satisfiable", 416, "The byte range starts after the end of the file."),
-    ("misdirected-request", 421, "The service does not accept this host name while it has no keys."),
-)
 
 
 @router.get("/login")
