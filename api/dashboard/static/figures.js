@@ -7,15 +7,6 @@ function material(color) {
   return new MeshStandardMaterial({ color, roughness: 0.58, metalness: 0 });
 }
 
-function glass(looks, on) {
-  for (const look of looks) {
-    look.transparent = on;
-    look.opacity = on ? 0.32 : 1;
-    look.depthWrite = !on;
-    look.needsUpdate = true;
-  }
-}
-
 function solid(geometry, look) {
   const mesh = new Mesh(geometry, look);
   mesh.castShadow = mesh.receiveShadow = true;
@@ -73,14 +64,9 @@ export class Hand {
     this.group.updateMatrixWorld(true);
   }
 
-  /** Make the hand transparent. */
-  setGlass(on) {
-    glass(this.looks, on);
-  }
-
-  /** Make the root body transparent. */
-  setHousingGlass(on) {
-    glass(this.housing, on);
+  /** Make the hand transparent, or only `housing`, the materials of its root body. */
+  setGlass(on, looks = this.looks) {
+    for (const look of looks) Object.assign(look, { transparent: on, opacity: on ? 0.32 : 1, depthWrite: !on, needsUpdate: true });
   }
 
   /** Show collision shapes instead of visual meshes. */
@@ -104,7 +90,7 @@ export class Hand {
   }
 }
 
-/** Object with its `mesh` at the pose in the model; `setWire` shows triangles. */
+/** Object with its `mesh` at the pose in the model. */
 export class Thing {
   constructor(model) {
     this.geometry = model.nodes[0].solid;
@@ -114,10 +100,14 @@ export class Thing {
     this.group = new Group();
     this.group.add(this.mesh);
   }
+}
 
-  setWire(on) {
-    this.look.wireframe = on;
-  }
+/** Hand in its pre-shape, or object, of a model. */
+export function figureOf(model) {
+  if (model.extras.kind !== "hand") return new Thing(model);
+  const hand = new Hand(model);
+  hand.pose([0, 0, 0, 1, 0, 0, 0], model.extras.preshape);
+  return hand;
 }
 
 /** Interpolate two poses, 0 to 1: linear for the position, slerp for the rotation. */

@@ -158,11 +158,9 @@ export class LiveStage extends Stage {
     const zooms = { "+": 0.88, "=": 0.88, "-": 1.14 };
     const offset = this.camera.position.clone().sub(this.controls.target);
     if (turns[event.key]) {
-      const [around, over] = turns[event.key];
-      const radius = offset.length();
-      const polar = Math.min(Math.max(Math.acos(offset.z / radius) + over, 0.05), Math.PI - 0.05);
-      const azimuth = Math.atan2(offset.y, offset.x) + around;
-      offset.set(radius * Math.sin(polar) * Math.cos(azimuth), radius * Math.sin(polar) * Math.sin(azimuth), radius * Math.cos(polar));
+      const [around, over] = turns[event.key], { up } = this.camera, polar = offset.angleTo(up);
+      const tilt = Math.min(Math.max(polar + over, 0.05), Math.PI - 0.05) - polar;
+      offset.applyAxisAngle(up.clone().cross(offset).normalize(), tilt).applyAxisAngle(up, around);
     } else if (zooms[event.key]) {
       offset.multiplyScalar(zooms[event.key]);
     } else {
@@ -186,11 +184,23 @@ export function besideHand(hand) {
   return side.multiplyScalar(1).addScaledVector(up, 0.55).addScaledVector(approach, -0.35);
 }
 
-/** Viewing direction of the palm of a hand in its own frame. */
-export function beforePalm(hand) {
-  const approach = new Vector3(...hand.extras.palm.approach);
+/** Viewing direction of a hand's palm in its own frame, or of an object. */
+export function beforePalm({ extras }) {
+  if (!extras) return new Vector3(1, -1.5, 0.8);
+  const approach = new Vector3(...extras.palm.approach);
   const up = new Vector3(0, 0, 1);
   const side = new Vector3().crossVectors(up, approach);
   if (side.length() < 0.2) return new Vector3(1, -1.2, 0.55);
   return approach.addScaledVector(side.normalize(), 0.75).addScaledVector(up, 0.35);
+}
+
+/** Start the waiting viewers of a kind; the figure tells why one cannot start, and where its content is. */
+export function startViewers(kind, start, instead) {
+  for (const figure of document.querySelectorAll(`[data-viewer=${kind}][data-state=loading]`)) {
+    figure.dataset.state = "reading";
+    start(figure).then(() => { figure.dataset.state = "ready"; }, (error) => {
+      figure.dataset.state = "failed";
+      figure.querySelector("[data-say]").textContent = `No 3D view: ${error.message}. ${instead}`;
+    });
+  }
 }
