@@ -7,6 +7,8 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any, Final
 
+from graspd.service.model.studies import count_outcomes, format_tick
+
 NONE: Final = "–"
 
 
@@ -107,6 +109,8 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
     "worker_time": worker_time,
     "bytes": size,
     "stamp": stamp,
+    "tick": format_tick,
+    "outcomes": count_outcomes,
     "shell": shlex.quote,
     "python": repr,
 }

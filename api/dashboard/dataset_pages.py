@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from starlette.datastructures import FormData
 
 from graspd.api.catalog.assets import Assets
-from graspd.api.catalog.datasets import Datasets
+from graspd.api.catalog.datasets import MOST_CELLS, Datasets
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.dashboard import figures
 from graspd.api.dashboard.form_uploads import asset_choices
@@ -25,8 +25,6 @@ from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 
 PAGE_SIZE: Final = 20
-#: Maximum number of cells of a matrix that is shown as a table; a larger matrix is a paginated list.
-MATRIX_CELLS: Final = 1000
 _CELLS_AT_ONCE: Final = 200
 Fields = Annotated[FormData, fields_of(4000)]
 
@@ -86,9 +84,8 @@ def dataset_page(
 ) -> HTMLResponse:
     dataset = datasets.get(name)
     chosen = State(state) if state in set(State) else None
-    as_matrix = dataset.cells <= MATRIX_CELLS and chosen is None
-    page = None if as_matrix else datasets.cells(name, state=chosen, limit=_CELLS_AT_ONCE, cursor=cursor)
-    cells = list(datasets.all_cells(name)) if page is None else page.items
+    as_matrix = dataset.cells <= MOST_CELLS and chosen is None
+    page = datasets.cells(name, state=chosen, limit=MOST_CELLS if as_matrix else _CELLS_AT_ONCE, cursor=cursor)
     return render(
         request,
         "dataset.html",
@@ -96,10 +93,10 @@ def dataset_page(
         events="" if dataset.state.is_final else "/events",
         refresh_s=0 if dataset.state.is_final else 5,
         dataset=dataset,
-        grid=figures.dataset_grid(dataset, cells) if as_matrix else None,
-        cells=cells,
+        grid=figures.dataset_grid(dataset, page.items) if as_matrix else None,
+        cells=page.items,
         chosen=chosen or "",
-        next=page.next if page else None,
+        next=page.next,
         snapshots=datasets.snapshots(name, limit=10).items,
     )
 

@@ -107,14 +107,6 @@ PITCH: Final = (40, 30)
 
 
 @dataclass(frozen=True)
-class CellSquare:
-    outcome: studies.Outcome
-    text: str
-    said: str
-    ringed: bool
-
-
-@dataclass(frozen=True)
 class Panel:
     """Panel of one method or family: rows from the top, columns from the left."""
 
@@ -122,33 +114,9 @@ class Panel:
     x: str
     y: str
     columns: list[str]
-    rows: list[tuple[str, list[CellSquare | None]]]
+    rows: list[tuple[str, list[studies.MapCell | None]]]
     line: str
     """Points of the theoretical boundary, over the cells."""
-
-    @property
-    def width(self) -> int:
-        return PITCH[0] * len(self.columns)
-
-    @property
-    def height(self) -> int:
-        return PITCH[1] * len(self.rows)
-
-
-@dataclass(frozen=True)
-class Share:
-    outcome: studies.Outcome
-    count: int
-    x: float
-    width: float
-
-
-@dataclass(frozen=True)
-class MapDrawing:
-    map: studies.StabilityMap
-    panels: list[Panel]
-    counts: dict[studies.Outcome, int]
-    reached: list[Share]
 
 
 def load_stability(store: Store) -> studies.Stability | None:
@@ -160,21 +128,10 @@ def load_stability(store: Store) -> studies.Stability | None:
         return None
 
 
-def draw_map(one: studies.StabilityMap) -> MapDrawing:
-    return MapDrawing(
-        map=one,
-        panels=[_panel(one, name) for name in one.panels],
-        counts={outcome: number for outcome, number in studies.count_outcomes(one.cells).items() if number},
-        reached=_outcome_shares(one.reached()),
-    )
-
-
-def _panel(one: studies.StabilityMap, name: str) -> Panel:
+def draw_panel(one: studies.StabilityMap, name: str) -> Panel:
     cells = one.panel_cells(name)
     xs, ys = ([*dict.fromkeys(getattr(cell, axis) for cell in cells)] for axis in ("x", "y"))
-    squares = {
-        (cell.x, cell.y): _cell_square(one, cell, ringed=one.is_partly_reachable and cell.reached) for cell in cells
-    }
+    squares = {(cell.x, cell.y): cell for cell in cells}
     line = one.lines.get(name, [])
     if any(isinstance(x, str) for x in xs):
         # Texts are labels of rows, because columns are narrow.
@@ -187,24 +144,3 @@ def _panel(one: studies.StabilityMap, name: str) -> Panel:
         for at_x, at_y in ((studies.tick_position(xs, x), studies.tick_position(ys, y)) for x, y in line)
     )
     return Panel(name, one.x, one.y, [studies.format_tick(x) for x in xs], rows, points)
-
-
-def _cell_square(one: studies.StabilityMap, cell: studies.MapCell, *, ringed: bool) -> CellSquare:
-    value = cell.note or (f"{cell.value:.3g}" if cell.value == cell.value else "no value")
-    return CellSquare(
-        outcome=cell.outcome,
-        text=cell.text,
-        said=f"{one.x} {studies.format_tick(cell.x)}, {one.y} {studies.format_tick(cell.y)}: {cell.outcome}; {value}",
-        ringed=ringed,
-    )
-
-
-def _outcome_shares(cells: Sequence[studies.MapCell]) -> list[Share]:
-    found = studies.count_outcomes(cells)
-    shares, x = [], 0.0
-    for outcome in studies.OUTCOMES:
-        if found[outcome]:
-            width = 100.0 * found[outcome] / len(cells)
-            shares.append(Share(outcome, found[outcome], x, width))
-            x += width
-    return shares

@@ -171,9 +171,8 @@ def paint_depth(depth: NDArray[Any]) -> NDArray[np.uint8]:
     if seen.any():
         low, high = np.percentile(depth[seen], (1, 99))
         place = np.clip((depth[seen] - low) / max(high - low, 1e-6), 0, 1) * (len(_DEPTH_COLOURS) - 1)
-        below = np.minimum(place.astype(int), len(_DEPTH_COLOURS) - 2)
-        share = (place - below)[:, None]
-        painted[seen] = _DEPTH_COLOURS[below] * (1 - share) + _DEPTH_COLOURS[below + 1] * share
+        steps = np.arange(len(_DEPTH_COLOURS))
+        painted[seen] = np.transpose([np.interp(place, steps, channel) for channel in _DEPTH_COLOURS.T])
     return painted
 
 

@@ -123,8 +123,16 @@ def chart_page(
 @router.get("/stability", dependencies=dependencies.READ)
 def stability_page(request: Request, store: dependencies.StoreOf) -> HTMLResponse:
     measured = figures.load_stability(store)
-    maps = [figures.draw_map(one) for one in measured.maps] if measured else []
-    return render(request, "stability.html", page="/engine", poll_s=_STUDY_S, measured=measured, maps=maps)
+    maps = measured.maps if measured else ()
+    return render(
+        request,
+        "stability.html",
+        page="/engine",
+        poll_s=_STUDY_S,
+        measured=measured,
+        maps=[(one, [figures.draw_panel(one, name) for name in one.panels]) for one in maps],
+        pitch=figures.PITCH,
+    )
 
 
 @router.get("/engine", dependencies=dependencies.READ)

@@ -102,8 +102,7 @@ export class Contacts {
     // Points are relative to the mesh, because numbers have 32 bits and the object's origin may be far away.
     this.frame = thing.mesh;
     this.field = new DistanceField(thing.geometry);
-    let count = 0;
-    hand.eachPoint(this.frame, () => { count += 1; });
+    const count = hand.bodies.reduce((sum, { points }) => sum + (points?.length ?? 0) / 3, 0);
     const dot = new SphereGeometry(DOT_M, 8, 6);
     this.dots = new InstancedMesh(dot, new MeshBasicMaterial(), count);
     this.dots.instanceMatrix.setUsage(DynamicDrawUsage);

@@ -13,6 +13,13 @@ function solid(geometry, look) {
   return mesh;
 }
 
+/** Move an object to a pose x y z [m], quaternion w x y z. */
+export function place(thing, [x, y, z, w, i, j, k]) {
+  thing.position.set(x, y, z);
+  thing.quaternion.set(i, j, k, w).normalize();
+  return thing;
+}
+
 /** Hand: `pose` moves its links; `group` is the drawing. */
 export class Hand {
   constructor(model) {
@@ -49,9 +56,7 @@ export class Hand {
 
   /** Set a posture: pose of the root link, and joint positions by name [rad or m]. */
   pose(rootPose, positions) {
-    const [x, y, z, qw, qx, qy, qz] = rootPose;
-    this.group.position.set(x, y, z);
-    this.group.quaternion.set(qx, qy, qz, qw);
+    place(this.group, rootPose);
     const turn = new Quaternion();
     for (const [name, joint] of this.joints) {
       const value = positions[name] ?? 0;

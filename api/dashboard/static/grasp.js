@@ -2,11 +2,11 @@
 // slider along the trajectory, planned or replayed in MuJoCo. Several views turn and move together.
 import { Group, Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
-import { Hand, Thing } from "./figures.js";
+import { Hand, place, Thing } from "./figures.js";
 import { Contacts } from "./contacts.js";
 import { Forces } from "./forces.js";
 import { Arrow, AXES } from "./marks.js";
-import { freeSide, place, staged } from "./scenery.js";
+import { freeSide, staged } from "./scenery.js";
 import { besideHand, LiveStage, startViewers } from "./stage.js";
 import { Way } from "./way.js";
 
