@@ -98,7 +98,7 @@ def stamp(value: str) -> str:
 
 #: Words for the kind of a scene; free grasps have none.
 _PLACES: Final = {"table": "on a table", "bin": "in a bin", "shelf": "on a shelf", "file": "in a scene of their own"}
-FILTERS: Final[Mapping[str, Callable[..., str]]] = {
+FILTERS: Final[Mapping[str, Callable[..., Any]]] = {
     "metric": metric,
     "count": count,
     "percent": percent,

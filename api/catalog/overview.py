@@ -17,14 +17,14 @@ from graspd.api.access.auth import caller, project_scope, require_ownership
 from graspd.api.access.keys import KeyFile, ProjectLimits
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.metrics import MetricsSnapshot
-from graspd.api.models import Health, Part, Worker
+from graspd.api.models import STAGE_LABELS, Health, Part, Worker
 from graspd.service.index.notes import Damage
 from graspd.service.index.queries.overview import read_index_status
 from graspd.service.index.views import FailureGroup, Stats, TaskView, UsageDay, View
 from graspd.service.model import errors
 from graspd.service.model.digests import digest_json
 from graspd.service.model.projects import ProjectScope
-from graspd.service.model.states import Priority, Stage
+from graspd.service.model.states import Stage
 from graspd.service.pipeline import deletion
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import check_service
@@ -97,8 +97,13 @@ class Overview:
     def failures(self) -> list[FailureGroup]:
         return self._services.index.overview.failures(limit=_FAILURES_SHOWN, scope=project_scope())
 
-    def depths(self) -> dict[tuple[Priority, Stage], int]:
-        return self._services.queue.depths()
+    def waiting(self) -> list[tuple[str, int]]:
+        """Return numbers of waiting tasks by stage; empty if Redis does not answer."""
+        try:
+            depths = self._services.queue.depths()
+        except errors.UnavailableError:
+            return []
+        return [(label, sum(n for (_, at), n in depths.items() if at is one)) for one, label in STAGE_LABELS.items()]
 
     def health(self) -> Health:
         return self._probes.health()

@@ -17,7 +17,7 @@ from graspd.api.dashboard.forms import fields_of, first_message, inputs_of, spli
 from graspd.api.dashboard.grasp_pages import COLUMNS
 from graspd.api.dashboard.job_list import change_jobs
 from graspd.api.dashboard.rendering import redirect, render
-from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, DatasetsOf, JobsOf
+from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, Cursor, DatasetsOf, JobsOf
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import OFFERED
@@ -35,12 +35,7 @@ router = APIRouter(prefix="/datasets", include_in_schema=False)
 
 
 @router.get("", dependencies=READ)
-def datasets_page(
-    request: Request,
-    datasets: DatasetsOf,
-    assets: AssetsOf,
-    cursor: Annotated[str | None, Query(max_length=512)] = None,
-) -> HTMLResponse:
+def datasets_page(request: Request, datasets: DatasetsOf, assets: AssetsOf, cursor: Cursor = None) -> HTMLResponse:
     return _render_datasets(request, datasets, assets, cursor=cursor)
 
 
@@ -76,11 +71,7 @@ def act_on_pairs(
 
 @router.get("/{name}", dependencies=READ)
 def dataset_page(
-    request: Request,
-    name: str,
-    datasets: DatasetsOf,
-    state: str = "",
-    cursor: Annotated[str | None, Query(max_length=512)] = None,
+    request: Request, name: str, datasets: DatasetsOf, state: str = "", cursor: Cursor = None
 ) -> HTMLResponse:
     dataset = datasets.get(name)
     chosen = State(state) if state in set(State) else None

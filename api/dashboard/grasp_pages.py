@@ -199,23 +199,9 @@ T = TypeVar("T")
 
 
 @router.post("/grasps/tag", dependencies=SUBMIT)
-def tag(tags: TagsOf, fields: Fields) -> RedirectResponse:
-    return _change_tag(tags, fields, on=True)
-
-
 @router.post("/grasps/untag", dependencies=SUBMIT)
-def untag(tags: TagsOf, fields: Fields) -> RedirectResponse:
-    return _change_tag(tags, fields, on=False)
-
-
-@router.post("/grasps/export", dependencies=READ)
-async def export(request: Request, tags: TagsOf, exports: ExportsOf, fields: Fields) -> StreamingResponse:
-    wanted = _validate(_FORMAT, fields.get("format") or "zip", "format")
-    return await export_response(request, tags, exports, _selection(fields), wanted)
-
-
-def _change_tag(tags: Tags, fields: FormData, *, on: bool) -> RedirectResponse:
-    name = _validate(_NAME, fields.get("tag"), "tag")
+def change_tag(request: Request, tags: TagsOf, fields: Fields) -> RedirectResponse:
+    name, on = _validate(_NAME, fields.get("tag"), "tag"), request.url.path.endswith("/tag")
     selection = _selection(fields)
     change = tags.tag_grasps(name, selection) if on else tags.untag_grasps(name, selection)
     grasps = f"{change.changed:,} {'grasp' if change.changed == 1 else 'grasps'}"
@@ -225,6 +211,12 @@ def _change_tag(tags: Tags, fields: FormData, *, on: bool) -> RedirectResponse:
         return redirect(here, said)
     view = {"view": str(fields["view"])} if fields.get("view") in ("table", "map") else {}
     return redirect(_address(dict(_filter_fields(fields)) | view), said)
+
+
+@router.post("/grasps/export", dependencies=READ)
+async def export(request: Request, tags: TagsOf, exports: ExportsOf, fields: Fields) -> StreamingResponse:
+    wanted = _validate(_FORMAT, fields.get("format") or "zip", "format")
+    return await export_response(request, tags, exports, _selection(fields), wanted)
 
 
 def _selection(fields: FormData) -> Selection:

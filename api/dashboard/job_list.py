@@ -1,17 +1,17 @@
-"""List of jobs: search, order, and changes of the selected jobs."""
+"""List of jobs: search, order, and changes of the selected jobs; search of the command palette."""
 
 from collections.abc import Iterable
 from typing import Annotated, Any, Final
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 from starlette.datastructures import FormData
 
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.dashboard.forms import fields_of
-from graspd.api.dashboard.rendering import redirect, render
-from graspd.api.routes.dependencies import READ, SUBMIT, JobsOf, next_address
+from graspd.api.dashboard.rendering import NAVIGATION, redirect, render
+from graspd.api.routes.dependencies import READ, SUBMIT, JobsOf, OverviewOf, next_address
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import State
 
@@ -79,3 +79,31 @@ def change_jobs(
     if problems:
         said += f" {len(problems)} unchanged, for example: {problems[0]}"
     return redirect(page, said[:400])
+
+
+_MOST: Final = 5
+_MENU: Final = (*NAVIGATION, ("/submit", "Submit"), ("/compare", "Compare datasets"), ("/deleted", "Recently deleted"))
+
+search_router = APIRouter(include_in_schema=False)
+
+
+@search_router.get("/search", dependencies=READ, response_model=None)
+def search_page(
+    request: Request,
+    jobs: JobsOf,
+    overview: OverviewOf,
+    q: Annotated[str, Query(max_length=100)] = "",
+    go: bool = False,
+) -> HTMLResponse | RedirectResponse:
+    """List what a text finds; `go` leads to the first result."""
+    text = q.strip()
+    found = [("page", name, path) for path, name in _MENU if text.lower() in name.lower()]
+    if text:
+        found += overview.search(text, limit=_MOST)
+        found += [
+            (f"job, {job.state}", f"{job.hand} × {job.object} {job.id[:8]}", f"/jobs/{job.id}")
+            for job in jobs.page(words=dict.fromkeys(text.split(), ()), limit=_MOST).items
+        ]
+    if go and found:
+        return RedirectResponse(found[0][2], status_code=303)
+    return render(request, "search.html", q=q, found=found)

@@ -176,10 +176,9 @@ def paint_depth(depth: NDArray[Any]) -> NDArray[np.uint8]:
     return painted
 
 
-def paint_segmentation(labels: NDArray[Any]) -> NDArray[np.uint8]:
-    """Colour labels (H, W) as (H, W, 3); neighbours beyond the palette share its last colour."""
-    return _CLASSES[np.minimum(labels, len(_CLASSES) - 1)]
-
-
 #: Functions that colour channels without colours.
-_PAINTERS: Final[dict[str, Callable[..., NDArray[Any]]]] = {"depth": paint_depth, "segmentation": paint_segmentation}
+_PAINTERS: Final[dict[str, Callable[..., NDArray[Any]]]] = {
+    "depth": paint_depth,
+    # Neighbours beyond the palette share its last colour.
+    "segmentation": lambda labels: _CLASSES[np.minimum(labels, len(_CLASSES) - 1)],
+}

@@ -13,28 +13,16 @@ from graspd.api.access.auth import SESSION_COOKIE, is_allowed
 from graspd.api.access.keys import SESSION_S, KeyFile, Scope
 from graspd.api.catalog import events
 from graspd.api.catalog.events import Webhooks
-from graspd.api.catalog.overview import Overview
-from graspd.api.dashboard import (
-    asset_pages,
-    dataset_pages,
-    figures,
-    forms,
-    grasp_pages,
-    job_list,
-    job_pages,
-    search,
-    tradeoff,
-)
+from graspd.api.dashboard import asset_pages, dataset_pages, figures, forms, grasp_pages, job_list, job_pages, tradeoff
 from graspd.api.dashboard.forms import FormEstimates
 from graspd.api.dashboard.job_pages import ShardPictures
 from graspd.api.dashboard.rendering import SEEN, environment, redirect, render, seen_end
-from graspd.api.models import STAGE_LABELS
 from graspd.api.problems import HTTP_PROBLEMS
 from graspd.api.routes import dependencies
 from graspd.api.routes.system import Since, Until
 from graspd.service.index.views import WorkerView
 from graspd.service.model.domain import METHODS
-from graspd.service.model.errors import ERRORS, InputError, UnavailableError
+from graspd.service.model.errors import ERRORS, InputError
 from graspd.service.model.webhooks import MAX_URL, End
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.records import What
@@ -63,7 +51,7 @@ def home(
         stats=overview.stats(),
         minutes=overview.valid_per_minute(),
         jobs=jobs.page(limit=_JOBS),
-        stages=stage_depths(overview),
+        stages=overview.waiting(),
         workers=[worker for worker in overview.workers() if is_recent(worker)],
         failures=overview.failures(),
         datasets=sorted(datasets.page(limit=_DATASETS).items, key=lambda dataset: dataset.state.is_final)[:4],
@@ -86,7 +74,7 @@ def workers_page(request: Request, overview: dependencies.OverviewOf, jobs: depe
         jobs={job_id: jobs.get_progress(job_id) for job_id in {task.job_id for task in tasks.values()}},
         busy=sum(worker.state == "busy" for worker in workers),
         alive=sum(worker.state != "lost" for worker in workers),
-        stages=stage_depths(overview),
+        stages=overview.waiting(),
         damage=overview.damage(),
     )
 
@@ -201,18 +189,6 @@ def is_recent(worker: WorkerView) -> bool:
     return worker.state != "lost" or age < _LOST_SHOWN
 
 
-def stage_depths(overview: Overview) -> list[tuple[str, int]]:
-    """Return numbers of waiting tasks by stage; empty if Redis does not answer."""
-    try:
-        depths = overview.depths()
-    except UnavailableError:
-        return []
-    totals = dict.fromkeys(STAGE_LABELS, 0)
-    for (_, stage), waiting in depths.items():
-        totals[stage] += waiting
-    return [(STAGE_LABELS[stage], waiting) for stage, waiting in totals.items()]
-
-
 _SUMMED = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
 
 
@@ -297,7 +273,7 @@ def _redirect_to_deletions(id: str) -> RedirectResponse:
 
 routers: Final = (
     router,
-    search.router,
+    job_list.search_router,
     job_list.router,
     job_pages.router,
     grasp_pages.router,
