@@ -93,7 +93,8 @@ def dataset_page(
 
 
 @router.post("/{name}/cells", dependencies=SUBMIT)
-def act_on_cells(name: str, jobs: JobsOf, fields: Fields) -> RedirectResponse:
+def act_on_cells(name: str, jobs: JobsOf, datasets: DatasetsOf, fields: Fields) -> RedirectResponse:
+    datasets.get(name)
     return change_jobs(jobs, str(fields.get("action", "")), map(str, fields.getlist("cell")), f"/datasets/{name}")
 
 
