@@ -133,10 +133,10 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
 
 
 def _middleware_statuses(path: str, method: str) -> list[int]:
-    """Return the statuses that middleware may send before a route runs."""
+    """Return the statuses that middleware or the errors of the catalog may send; routes declare others."""
     statuses = [421]
     if path.startswith(("/v1/", "/metrics")):
-        statuses += [401, 403, 429, 503]
+        statuses += [400, 401, 403, 404, 429, 503]
     if method not in ("get", "head"):
-        statuses += [403, 408, 413, 415]
+        statuses += [403, 408, 409, 413, 415]
     return statuses

@@ -7,6 +7,8 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any, Final
 
+from graspd.service.model.studies import count_outcomes, format_tick
+
 NONE: Final = "–"
 
 
@@ -96,7 +98,7 @@ def stamp(value: str) -> str:
 
 #: Words for the kind of a scene; free grasps have none.
 _PLACES: Final = {"table": "on a table", "bin": "in a bin", "shelf": "on a shelf", "file": "in a scene of their own"}
-FILTERS: Final[Mapping[str, Callable[..., str]]] = {
+FILTERS: Final[Mapping[str, Callable[..., Any]]] = {
     "metric": metric,
     "count": count,
     "percent": percent,
@@ -107,6 +109,8 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
     "worker_time": worker_time,
     "bytes": size,
     "stamp": stamp,
+    "tick": format_tick,
+    "outcomes": count_outcomes,
     "shell": shlex.quote,
     "python": repr,
 }

@@ -135,24 +135,20 @@ class Posture(BaseModel):
     joint_positions: list[float] = Field(description="joint positions in the order of joint_names [rad or m]")
 
 
-class Waypoint(BaseModel):
+class Waypoint(Posture):
     """One posture on the trajectory of a grasp, in the frame of the object at rest."""
 
     name: str = Field(description="standoff, pregrasp, grasp, squeeze, lift; empty between them")
     place: float = Field(description="position on a slider: named postures at 0, 1, 2, ..., others evenly spaced")
-    hand_pose: list[float] = Field(description="pose of the root link: x y z [m], quaternion w x y z")
-    joint_positions: list[float] = Field(description="joint positions in the order of joint_names [rad or m]")
     carried: list[float] = Field(description="displacement of the object from rest: x y z [m]")
 
 
-class ReplayPoint(BaseModel):
+class ReplayPoint(Posture):
     """State of a replayed validation, in the frame of the object at rest [m, N, N m]."""
 
     name: str = Field(description="named posture as in `Waypoint`, or pushes; empty between them")
     place: float = Field(description="position on the slider of `Waypoint`; all after the squeeze takes one unit")
     phase: str = Field(description="approach, closing, lifting, holding, or the direction of a push")
-    hand_pose: list[float]
-    joint_positions: list[float]
     object_pose: list[float] = Field(description="pose relative to rest: x y z, quaternion w x y z")
     contacts: list[list[float]] = Field(
         [], description="contacts of the object: position, inward normal, force on it, torque, 1 if the hand touches"
@@ -287,17 +283,6 @@ class Worker(WorkerView):
 
     stage: Stage | None = Field(None, description="stage of the current task")
     lease_age_s: float | None = Field(None, description="time since its last heartbeat [s]; null once it is gone")
-
-
-class Histogram(BaseModel):
-    """Distribution of one metric over the grasps of a job, or over a sample of about 20,000."""
-
-    metric: str
-    count: int
-    mean: float
-    low: float
-    high: float
-    counts: list[int] = Field(description="counts in equal bins from low to high")
 
 
 def stage_state(stage: StageProgress) -> State:

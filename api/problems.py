@@ -13,7 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
 from graspd.service.model.base import problem_text
-from graspd.service.model.errors import GraspdError, InputError, RateError, StoreUnavailable
+from graspd.service.model.errors import GraspdError, InputError, LimitError, NotFoundError, RateError, StoreUnavailable
 
 MEDIA_TYPE: Final = "application/problem+json"
 RETRY_AFTER_S: Final = 2
@@ -21,22 +21,19 @@ _FULL_SAID: Final = "the disk of this service is full; the same request succeeds
 _LONGEST_POINTER: Final = 200
 _MOST_ERRORS: Final = 100
 
-HTTP_SLUGS: Final[dict[int, str]] = {
-    400: "bad-request",
-    401: "unauthorized",
-    403: "forbidden",
-    404: "not-found",
-    405: "method-not-allowed",
-    406: "not-acceptable",
-    408: "request-timeout",
-    411: "length-required",
-    413: "too-large",
-    415: "unsupported-media-type",
-    416: "range-not-satisfiable",
-    421: "misdirected-request",
-    422: "invalid-input",
-    429: RateError.slug,
+#: Slug and meaning of errors outside the domain errors, by status.
+HTTP_PROBLEMS: Final = {
+    400: ("bad-request", "The body or form cannot be read."),
+    401: ("unauthorized", "A valid key is required."),
+    403: ("forbidden", "The scope of the key is insufficient, or the request comes from another web site."),
+    405: ("method-not-allowed", "The address does not support this method."),
+    408: ("request-timeout", "The body arrives too slowly."),
+    415: ("unsupported-media-type", "The body is compressed or otherwise encoded; send it unencoded."),
+    416: ("range-not-satisfiable", "The byte range starts after the end of the file."),
+    421: ("misdirected-request", "The service does not accept this host name while it has no keys."),
 }
+_HTTP_SLUGS: Final = {status: slug for status, (slug, _) in HTTP_PROBLEMS.items()}
+_HTTP_SLUGS.update((error.status, error.slug) for error in (NotFoundError, LimitError, InputError, RateError))
 
 
 class FieldError(BaseModel):
@@ -109,7 +106,7 @@ def describe_error(error: Exception) -> tuple[str, str, int, str]:
     else:
         detail = "an unexpected error; the log has it under this request id"
         return GraspdError.slug, GraspdError.title, GraspdError.status, detail
-    return HTTP_SLUGS.get(status, "internal"), HTTPStatus(status).phrase, status, detail
+    return _HTTP_SLUGS.get(status, "internal"), HTTPStatus(status).phrase, status, detail
 
 
 def _is_disk_full(error: BaseException | None) -> bool:
@@ -201,14 +198,7 @@ def install_handlers(app: FastAPI, page: Callable[[Request, dict[str, Any]], Res
     app.add_exception_handler(RequestValidationError, bad_request)
 
 
-def problem_responses(
-    *statuses: int, others: dict[int | str, dict[str, Any]] | None = None
-) -> dict[int | str, dict[str, Any]]:
-    """Return OpenAPI entries of a route: `others`, and a problem document for each status."""
-    return (others or {}) | {
-        status: {
-            "description": HTTPStatus(status).phrase,
-            "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
-        }
-        for status in statuses
-    }
+def problem_responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return OpenAPI entries of a route: a problem document for each status."""
+    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    return {status: {"description": HTTPStatus(status).phrase, "content": content} for status in statuses}

@@ -1,12 +1,11 @@
 """Quotas of keys and projects: grasps in unfinished jobs, jobs or grasps per day. Idempotency keys.
 
-All API processes count in Redis, each submission in one atomic step. A loss of Redis resets the counters.
-From submission to end, a job counts with its requested grasps. The index is queried for ended jobs only if the quota
-would be exceeded, so a submission needs one round trip.
+All API processes count in Redis. A lock lets the submissions of a key or project with limits pass one by one. A loss of
+Redis resets the counters. From submission to end, a job counts with its requested grasps. The index is queried for
+ended jobs only if the quota would be exceeded.
 """
 
 import logging
-import uuid
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -25,78 +24,9 @@ from graspd.service.settings import Settings
 log = logging.getLogger(__name__)
 #: Time without a submission [s] after which the counters of a key expire.
 _KEPT_S: Final = 30 * 86400
-_AT_ONCE: Final = 1000
-
-#: Time [s] after which a pending submission is taken as that of a dead process.
-_PENDING_S: Final = 60
-
-# KEYS[1] holds the sum under `grasps`, and an entry under each job: its grasps, the last claim that counted them, and
-# the time until which this claim is pending. The time is 0 once the job is in the index.
-_CLAIM: Final = """
-local job, grasps, number = ARGV[1], tonumber(ARGV[2]), ARGV[7]
-local most_grasps, most_today, amount = tonumber(ARGV[3]), tonumber(ARGV[4]), tonumber(ARGV[6])
-local now = tonumber(redis.call('TIME')[1])
-local entry = function(size) return size .. ' ' .. number .. ' ' .. (now + tonumber(ARGV[8])) end
-local known = redis.call('HGET', KEYS[1], job)
-if known then
-  local size, till = string.match(known, '^(%d+) %w+ (%d+)$')
-  redis.call('HSET', KEYS[1], job, entry(size or known))
-  return {till and tonumber(till) > now and 'shared' or 'known', '0'}
-end
-local held = tonumber(redis.call('HGET', KEYS[1], 'grasps') or '0')
-if most_grasps > 0 and held + grasps > most_grasps then return {'grasps', tostring(held)} end
-local today = tonumber(redis.call('GET', KEYS[2]) or '0')
-if most_today > 0 and today + amount > most_today then return {'today', tostring(today)} end
-redis.call('HSET', KEYS[1], job, entry(ARGV[2]))
-redis.call('HINCRBY', KEYS[1], 'grasps', grasps)
-redis.call('EXPIRE', KEYS[1], ARGV[5])
-if amount > 0 then
-  redis.call('INCRBY', KEYS[2], amount)
-  redis.call('EXPIRE', KEYS[2], 2 * 86400)
-end
-return {'', '0'}
-"""
-
-#: Settles a claim once the job is in the index; another claim of the same job may already have dropped the entry.
-_SETTLE: Final = """
-local known = redis.call('HGET', KEYS[1], ARGV[1])
-if not known then redis.call('HINCRBY', KEYS[1], 'grasps', ARGV[2]) end
-redis.call('HSET', KEYS[1], ARGV[1], string.match(known or ARGV[2], '^%d+') .. ' ' .. ARGV[3] .. ' 0')
-"""
-
-#: Drops jobs whose entries are unchanged since they were read; ARGV: job, entry, job, entry, ...
-_DROP: Final = """
-for i = 1, #ARGV, 2 do
-  local known = redis.call('HGET', KEYS[1], ARGV[i])
-  if known and known == ARGV[i + 1] then
-    redis.call('HDEL', KEYS[1], ARGV[i])
-    redis.call('HINCRBY', KEYS[1], 'grasps', -tonumber(string.match(known, '^%d+')))
-  end
-end
-"""
-
-#: Entries of all jobs without a pending submission.
-_ENTERED: Final = """
-local now, found = tonumber(redis.call('TIME')[1]), {}
-local all = redis.call('HGETALL', KEYS[1])
-for i = 1, #all, 2 do
-  local till = string.match(all[i + 1], '^%d+ %w+ (%d+)$')
-  if all[i] ~= 'grasps' and not (till and tonumber(till) > now) then
-    found[#found + 1] = all[i]
-    found[#found + 1] = all[i + 1]
-  end
-end
-return found
-"""
-
-#: Drops the entry of one claim, unless a later claim took it over.
-_UNDO: Final = """
-local known = redis.call('HGET', KEYS[1], ARGV[1])
-if known and string.match(known, '^%d+ (%w+)') == ARGV[2] then
-  redis.call('HDEL', KEYS[1], ARGV[1])
-  redis.call('HINCRBY', KEYS[1], 'grasps', -tonumber(string.match(known, '^%d+')))
-end
-"""
+#: Time [s] after which the lock of a dead process ends, and the longest wait for another submission.
+_LOCKED_S: Final = 60
+_PATIENCE_S: Final = 20
 
 
 @dataclass
@@ -118,7 +48,7 @@ class _Holder:
 
     @property
     def held_key(self) -> str:
-        return f"graspd:quota:{self.name}:held"
+        return f"graspd:quota:{self.name}:jobs"
 
     @property
     def day_key(self) -> str:
@@ -189,53 +119,48 @@ class Quotas:
     def _count_claim(
         self, holder: _Holder, claim: SubmissionClaim, job: str, grasps: int, *, is_new: bool
     ) -> Iterator[None]:
-        number = uuid.uuid4().hex
-        today = 0 if not is_new else 1 if holder.counts_jobs else grasps
-        met = self._claim(holder, job, grasps, number, today)
-        try:
-            yield
-        except BaseException:
-            claim.counts = False
-            raise
-        finally:
+        redis, today, is_counted = self._connection, 0 if not is_new else 1 if holder.counts_jobs else grasps, False
+        with ExitStack() as locked:
             with self._log_outage(holder):
-                if claim.counts or met == "known":
-                    self._connection.eval(_SETTLE, 1, holder.held_key, job, grasps, number)
-                else:
-                    self._connection.eval(_UNDO, 1, holder.held_key, job, number)
-                # Of two claims for one job, only the claim that created the job counts as a job of today.
-                if today and met == "shared" and claim.counts:
-                    self._connection.incrby(holder.day_key, today)
-                if today and met == "" and not claim.counts:
-                    self._connection.decrby(holder.day_key, today)
+                lock = redis.lock(f"{holder.held_key}:lock", _LOCKED_S, sleep=0.02, blocking_timeout=_PATIENCE_S)
+                if not lock.acquire():
+                    raise QuotaError(f"{holder.words} has too many submissions at once; try again in a moment")
+                locked.callback(self._release, lock)
+                if not redis.hexists(holder.held_key, job):
+                    self._check_limits(holder, grasps, today)
+                    # A process that dies now leaves an entry that is dropped like that of an ended job.
+                    with redis.pipeline() as batch:
+                        batch.hset(holder.held_key, job, grasps).expire(holder.held_key, _KEPT_S)
+                        batch.incrby(holder.day_key, today).expire(holder.day_key, 2 * 86400).execute()
+                    is_counted = True
+            try:
+                yield
+            except BaseException:
+                claim.counts = False
+                raise
+            finally:
+                if is_counted and not claim.counts:
+                    with self._log_outage(holder), redis.pipeline() as batch:
+                        batch.hdel(holder.held_key, job).decrby(holder.day_key, today).execute()
 
-    def _claim(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> str:
-        """Return `shared` (another claim is pending), `known`, `unknown` (no Redis), or "" for a new job."""
-        met, amount = self._try_claim(holder, job, grasps, number, today)
-        if met == "grasps":
-            with self._log_outage(holder):
-                self._drop_ended(holder)
-            met, amount = self._try_claim(holder, job, grasps, number, today)
-        if met in ("grasps", "today"):
-            raise holder.refusal(met, amount)
-        return met
+    def _check_limits(self, holder: _Holder, grasps: int, today: int) -> None:
+        """Raise QuotaError if a new job exceeds a limit; entries of ended jobs are dropped if space is needed."""
+        entries = {job.decode(): int(size) for job, size in self._connection.hgetall(holder.held_key).items()}
+        if holder.grasps and sum(entries.values()) + grasps > holder.grasps:
+            unfinished = set(self._unfinished(list(entries)))
+            held = sum(size for job, size in entries.items() if job in unfinished)
+            if held + grasps > holder.grasps:
+                raise holder.refusal("grasps", held)
+            self._connection.hdel(holder.held_key, *(entries.keys() - unfinished))
+        used = int(self._connection.get(holder.day_key) or 0)
+        if holder.today and today and used + today > holder.today:
+            raise holder.refusal("today", used)
 
-    def _try_claim(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> tuple[str, int]:
-        limits = (holder.grasps, holder.today if today else 0)
-        about = (job, grasps, *limits, _KEPT_S, today, number, _PENDING_S)
-        met, amount = b"unknown", b"0"
-        with self._log_outage(holder):
-            met, amount = self._connection.eval(_CLAIM, 2, holder.held_key, holder.day_key, *about)
-        return met.decode(), int(amount)
-
-    def _drop_ended(self, holder: _Holder) -> None:
-        """Drop the entries of ended jobs, except jobs whose submission is pending."""
-        found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held_key)]
-        entries = dict(zip(found[::2], found[1::2], strict=True))
-        ended = sorted(entries.keys() - set(self._unfinished(list(entries))))
-        for start in range(0, len(ended), _AT_ONCE):
-            some = [word for job in ended[start : start + _AT_ONCE] for word in (job, entries[job])]
-            self._connection.eval(_DROP, 1, holder.held_key, *some)
+    @staticmethod
+    def _release(lock: Any) -> None:
+        # The lock may have ended, or Redis may be gone; then nothing is to be released.
+        with suppress(RedisError):
+            lock.release()
 
     @contextmanager
     def _log_outage(self, holder: _Holder) -> Iterator[None]:

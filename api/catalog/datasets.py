@@ -76,14 +76,6 @@ class Datasets:
         """Return cells (hand x object) of a dataset with their jobs, ordered by hand."""
         return self._services.index.datasets.cells(name, state=state, limit=limit, cursor=cursor, scope=project_scope())
 
-    def all_cells(self, name: str) -> Iterator[CellView]:
-        cursor: str | None = None
-        while True:
-            page = self.cells(name, limit=_AT_ONCE, cursor=cursor)
-            yield from page.items
-            if (cursor := page.next) is None:
-                return
-
     def matrix(self) -> list[MatrixCell]:
         """Return each pair of hand and object that has a job, with or without a dataset."""
         return self._services.index.overview.matrix(scope=project_scope())
@@ -127,7 +119,8 @@ class Datasets:
         return Comparison(*both, list(_differing_settings(*both)), self._cell_pairs(one, other) if few else [], metrics)
 
     def _cell_pairs(self, one: str, other: str) -> list[CellPair]:
-        cells = [{(cell.hand, cell.object): cell for cell in self.all_cells(name)} for name in (one, other)]
+        pages = [self.cells(name, limit=MOST_CELLS) for name in (one, other)]
+        cells = [{(cell.hand, cell.object): cell for cell in page.items} for page in pages]
         names = sorted({*cells[0], *cells[1]})
         return [CellPair(*name, cells[0].get(name), cells[1].get(name)) for name in names]
 
@@ -137,9 +130,8 @@ class Datasets:
         return dataset
 
 
-#: Most cells that are compared one by one; a longer table would be unreadable.
+#: Most cells that one table shows; a longer one would be unreadable.
 MOST_CELLS: Final = 1000
-_AT_ONCE: Final = 200
 
 
 @dataclass(frozen=True)

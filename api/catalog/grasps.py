@@ -21,7 +21,7 @@ from graspd.api.catalog.facets import COLUMNS, PINCH, SAMPLE, Columns, Facets, c
 from graspd.api.catalog.grasp_map import features, nearest, principal_components
 from graspd.service import user_cache
 from graspd.service.index.queries.grasps import GraspFilter, GraspSort, Metric
-from graspd.service.index.queries.statistics import GraspKinds
+from graspd.service.index.queries.statistics import Distribution, GraspKinds
 from graspd.service.index.views import GraspView, JobView, Page
 from graspd.service.model import metrics
 from graspd.service.model.errors import DamagedError, InputError, LimitError, NotFoundError, UnavailableError
@@ -191,20 +191,19 @@ class Grasps:
         user_cache.store(kept, found.stdout, limit_bytes=_REPLAYS_BYTES)
         return found.stdout
 
-    def statistics(self, job: JobView | models.JobDetail) -> tuple[list[models.Histogram], models.Diversity | None]:
+    def statistics(self, job: JobView | models.JobDetail) -> tuple[dict[Metric, Distribution], models.Diversity | None]:
         """Return distributions and diversity of a job's valid grasps; without validation, of all stored ones."""
         validated = job.request.validation != "none"
         count = job.valid if validated else job.grasps
-        return self._statistics(job.id, validated, count) if count else ([], None)
+        return self._statistics(job.id, validated, count) if count else ({}, None)
 
     def _read_statistics(
         self, job_id: str, validated: bool, count: int
-    ) -> tuple[list[models.Histogram], models.Diversity | None]:
+    ) -> tuple[dict[Metric, Distribution], models.Diversity | None]:
         """Read the statistics of a job; `count` is only part of the cache key."""
         where, known = GraspFilter(job=job_id, valid=True if validated else None), self._index.statistics
         found = known.compare_distributions([where], MEAN_METRICS)
-        histograms = [models.Histogram(metric=name, **vars(one)) for name, (one,) in found.items() if one]
-        return histograms, _diversity(known.kinds(where))
+        return {name: one for name, (one,) in found.items() if one}, _diversity(known.kinds(where))
 
 
 def _diversity(kinds: GraspKinds) -> models.Diversity | None:

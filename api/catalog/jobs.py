@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from graspd.api.access.auth import ForeignResource, caller, caller_id, project_scope, require_ownership
 from graspd.api.access.quotas import Idempotency, Quotas
-from graspd.api.catalog.grasps import MEAN_METRICS, Grasps
+from graspd.api.catalog.grasps import Grasps
 from graspd.api.models import Job, JobDetail, MeanMetrics, Shard, StageStatus, stage_state
 from graspd.service.index.views import JobView, Page, ShardView, StageProgress, TaskView
 from graspd.service.model import errors
@@ -161,14 +161,14 @@ class Jobs:
             self._services.index.jobs.get(job_id, scope=project_scope()), self._reported_tasks(job_id)
         )
 
-    def change(self, action: str, job_ids: Iterable[str]) -> tuple[int, list[str]]:
-        """Cancel, retry or delete jobs; return the number of changed ones, and why others were not."""
-        acts: dict[str, Callable[[str], object]]
-        acts = {"cancel": self.cancel, "retry": self.retry, "delete": self.delete}
+    def change(self, action: str, wanted: Iterable[Any]) -> tuple[int, list[str]]:
+        """Cancel, retry or delete jobs, or submit requests; return the number of successes, and causes of refusals."""
+        acts: dict[str, Callable[[Any], object]]
+        acts = {"submit": self.submit, "cancel": self.cancel, "retry": self.retry, "delete": self.delete}
         changed, problems = 0, []
-        for job_id in job_ids:
+        for one in wanted:
             try:
-                acts[action](job_id)
+                acts[action](one)
                 changed += 1
             except (errors.ConflictError, errors.NotFoundError, ForeignResource, errors.LimitError) as error:
                 problems.append(str(error))
@@ -206,14 +206,13 @@ class Jobs:
         return job
 
     def _job_detail(self, job: JobView) -> JobDetail:
-        histograms, diversity = self._grasps.statistics(job)
-        mean = {data.metric: data.mean for data in histograms}
+        distributions, diversity = self._grasps.statistics(job)
         shards = self._shards.page(job=job.id, limit=_PAGE).items
         return JobDetail(
             **self._job_model(job, self._reported_tasks(job.id)).model_dump(),
             **{name: getattr(job, name) for name in _DETAILS},
             attempts=self._services.index.jobs.attempts(job=job.id, limit=50),
-            mean=MeanMetrics(**{metric: mean.get(metric) for metric in MEAN_METRICS}),
+            mean=MeanMetrics(**{name: one.mean for name, one in distributions.items()}),
             diversity=diversity,
             shards=sorted(shards, key=lambda shard: (shard.batch, _ORDER[shard.stage])),
         )

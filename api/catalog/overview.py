@@ -17,14 +17,14 @@ from graspd.api.access.auth import caller, project_scope, require_ownership
 from graspd.api.access.keys import KeyFile, ProjectLimits
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.metrics import MetricsSnapshot
-from graspd.api.models import Health, Part, Worker
+from graspd.api.models import STAGE_LABELS, Health, Part, Worker
 from graspd.service.index.notes import Damage
 from graspd.service.index.queries.overview import read_index_status
 from graspd.service.index.views import FailureGroup, Stats, TaskView, UsageDay, View
 from graspd.service.model import errors
 from graspd.service.model.digests import digest_json
 from graspd.service.model.projects import ProjectScope
-from graspd.service.model.states import Priority, Stage
+from graspd.service.model.states import Stage
 from graspd.service.pipeline import deletion
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import check_service
@@ -87,18 +87,23 @@ class Overview:
     def stats(self) -> Stats:
         return self._services.index.overview.stats(scope=project_scope())
 
-    def valid_per_minute(self) -> list[int]:
-        """Return the numbers of valid grasps made in each of the last `MINUTES`, oldest first."""
+    def valid_per_minute(self) -> dict[str, int]:
+        """Return the numbers of valid grasps made in each of the last `MINUTES`, by minute (UTC), oldest first."""
         start = datetime.now(UTC) - timedelta(minutes=MINUTES - 1)
         minutes = [f"{start + timedelta(minutes=minute):%Y-%m-%dT%H:%M}" for minute in range(MINUTES)]
         made = self._services.index.overview.valid_per_minute(since=minutes[0], scope=project_scope())
-        return [made.get(minute, 0) for minute in minutes]
+        return dict.fromkeys(minutes, 0) | made
 
     def failures(self) -> list[FailureGroup]:
         return self._services.index.overview.failures(limit=_FAILURES_SHOWN, scope=project_scope())
 
-    def depths(self) -> dict[tuple[Priority, Stage], int]:
-        return self._services.queue.depths()
+    def waiting(self) -> list[tuple[str, int]]:
+        """Return numbers of waiting tasks by stage; empty if Redis does not answer."""
+        try:
+            depths = self._services.queue.depths()
+        except errors.UnavailableError:
+            return []
+        return [(label, sum(n for (_, at), n in depths.items() if at is one)) for one, label in STAGE_LABELS.items()]
 
     def health(self) -> Health:
         return self._probes.health()

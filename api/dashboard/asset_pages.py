@@ -3,9 +3,9 @@
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import lru_cache
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 from starlette.datastructures import FormData
 
@@ -13,7 +13,7 @@ from graspd.api.catalog.assets import Assets
 from graspd.api.dashboard.forms import first_message
 from graspd.api.dashboard.rendering import redirect, render
 from graspd.api.routes.assets import CorrectionRequest, store_correction
-from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf
+from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, Cursor
 from graspd.service.index.views import AssetView
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.states import AssetKind
@@ -25,13 +25,12 @@ PAGE_SIZE: Final = 50
 _CHECK_S: Final = 2
 _MAX_FIELDS: Final = 16 + 3 * MAX_ENTRIES
 _COUNTED: Final = (("dofs", "Joints"), ("fingertips", "Fingertips"))
-CursorParameter = Annotated[str | None, Query(max_length=512)]
 
 router = APIRouter(include_in_schema=False)
 
 
 @router.get("/hands", dependencies=READ)
-def hands_page(request: Request, assets: AssetsOf, cursor: CursorParameter = None) -> HTMLResponse:
+def hands_page(request: Request, assets: AssetsOf, cursor: Cursor = None) -> HTMLResponse:
     """Show all hands, also refused ones; their pages state the reason."""
     networks = [] if cursor else assets.page(AssetKind.NETWORK, limit=PAGE_SIZE).items
     about = {"networks": networks, "network_hands": {one.digest: hand_line(one.facts) for one in networks}}
@@ -39,7 +38,7 @@ def hands_page(request: Request, assets: AssetsOf, cursor: CursorParameter = Non
 
 
 @router.get("/objects", dependencies=READ)
-def objects_page(request: Request, assets: AssetsOf, cursor: CursorParameter = None) -> HTMLResponse:
+def objects_page(request: Request, assets: AssetsOf, cursor: Cursor = None) -> HTMLResponse:
     """Show all objects, also refused ones; their pages state the reason."""
     return _render_list(request, assets, AssetKind.OBJECT, cursor, networks=[])
 

@@ -8,29 +8,25 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from pydantic import ValidationError
 from starlette.datastructures import FormData
 
-from graspd.api.access.auth import ForeignResource
 from graspd.api.catalog.assets import Assets
-from graspd.api.catalog.datasets import Datasets
+from graspd.api.catalog.datasets import MOST_CELLS, Datasets
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.dashboard import figures
-from graspd.api.dashboard.figures import paired_bars
 from graspd.api.dashboard.form_uploads import asset_choices
 from graspd.api.dashboard.forms import fields_of, first_message, inputs_of, split_list
 from graspd.api.dashboard.grasp_pages import COLUMNS
+from graspd.api.dashboard.job_list import change_jobs
 from graspd.api.dashboard.rendering import redirect, render
-from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, DatasetsOf, JobsOf
+from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, Cursor, DatasetsOf, JobsOf
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.errors import ConflictError, InputError
+from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import OFFERED
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 
 PAGE_SIZE: Final = 20
-#: Maximum number of cells of a matrix that is shown as a table; a larger matrix is a paginated list.
-MATRIX_CELLS: Final = 1000
 _CELLS_AT_ONCE: Final = 200
 Fields = Annotated[FormData, fields_of(4000)]
-_DONE: Final = {"submit": "submitted", "retry": "retried", "cancel": "cancelled"}
 
 _INPUTS: Final = inputs_of(cells=True)
 _MAKE: Final = {"name": "", "grasps": "320", "fidelity": "standard"} | {one.name: one.default for one in _INPUTS}
@@ -39,12 +35,7 @@ router = APIRouter(prefix="/datasets", include_in_schema=False)
 
 
 @router.get("", dependencies=READ)
-def datasets_page(
-    request: Request,
-    datasets: DatasetsOf,
-    assets: AssetsOf,
-    cursor: Annotated[str | None, Query(max_length=512)] = None,
-) -> HTMLResponse:
+def datasets_page(request: Request, datasets: DatasetsOf, assets: AssetsOf, cursor: Cursor = None) -> HTMLResponse:
     return _render_datasets(request, datasets, assets, cursor=cursor)
 
 
@@ -69,28 +60,23 @@ def act_on_pairs(
     try:
         if action == "submit":
             options = {key: str(fields[key]) for key in ("grasps", "fidelity") if fields.get(key)}
-            wanted = [JobRequest.model_validate(options | {"hand": hand, "object": obj}) for hand, obj in pairs]
-            done, left = _apply_to_each(jobs.submit, wanted)
+            filled = [options | {"hand": hand, "object": obj} for hand, obj in pairs]
+            wanted: list[Any] = [JobRequest.model_validate(one) for one in filled]
         else:
-            done, left = _apply_to_each(_job_action(jobs, action), _jobs_of(jobs, pairs, action))
+            wanted = _jobs_of(jobs, pairs, action)
+        return change_jobs(jobs, action, wanted, "/datasets", ("submit", "retry", "cancel"))
     except (ValidationError, InputError) as error:
         return _render_datasets(request, datasets, assets, problem=first_message(error), status=422)
-    return redirect("/datasets", _summary(action, done, left))
 
 
 @router.get("/{name}", dependencies=READ)
 def dataset_page(
-    request: Request,
-    name: str,
-    datasets: DatasetsOf,
-    state: str = "",
-    cursor: Annotated[str | None, Query(max_length=512)] = None,
+    request: Request, name: str, datasets: DatasetsOf, state: str = "", cursor: Cursor = None
 ) -> HTMLResponse:
     dataset = datasets.get(name)
     chosen = State(state) if state in set(State) else None
-    as_matrix = dataset.cells <= MATRIX_CELLS and chosen is None
-    page = None if as_matrix else datasets.cells(name, state=chosen, limit=_CELLS_AT_ONCE, cursor=cursor)
-    cells = list(datasets.all_cells(name)) if page is None else page.items
+    as_matrix = dataset.cells <= MOST_CELLS and chosen is None
+    page = datasets.cells(name, state=chosen, limit=MOST_CELLS if as_matrix else _CELLS_AT_ONCE, cursor=cursor)
     return render(
         request,
         "dataset.html",
@@ -98,19 +84,18 @@ def dataset_page(
         events="" if dataset.state.is_final else "/events",
         refresh_s=0 if dataset.state.is_final else 5,
         dataset=dataset,
-        grid=figures.dataset_grid(dataset, cells) if as_matrix else None,
-        cells=cells,
+        grid=figures.dataset_grid(dataset, page.items) if as_matrix else None,
+        cells=page.items,
         chosen=chosen or "",
-        next=page.next if page else None,
+        next=page.next,
         snapshots=datasets.snapshots(name, limit=10).items,
     )
 
 
 @router.post("/{name}/cells", dependencies=SUBMIT)
-def act_on_cells(name: str, jobs: JobsOf, fields: Fields) -> RedirectResponse:
-    action = str(fields.get("action", ""))
-    done, left = _apply_to_each(_job_action(jobs, action), [str(cell) for cell in fields.getlist("cell")])
-    return redirect(f"/datasets/{name}", _summary(action, done, left))
+def act_on_cells(name: str, jobs: JobsOf, datasets: DatasetsOf, fields: Fields) -> RedirectResponse:
+    datasets.get(name)
+    return change_jobs(jobs, str(fields.get("action", "")), map(str, fields.getlist("cell")), f"/datasets/{name}")
 
 
 @router.post("/{name}/{action}", dependencies=SUBMIT)
@@ -127,13 +112,6 @@ def act(name: str, action: str, datasets: DatasetsOf) -> RedirectResponse:
     return redirect(f"/datasets/{name}", said)
 
 
-def _job_action(jobs: Jobs, action: str) -> Callable[[str], Any]:
-    do = {"retry": jobs.retry, "cancel": jobs.cancel}
-    if action not in do:
-        raise InputError(f"cells have no action {action!r}; they can be submitted, retried or cancelled")
-    return do[action]
-
-
 def _jobs_of(jobs: Jobs, pairs: Iterable[tuple[str, str]], action: str) -> list[str]:
     states = (State.FAILED, State.CANCELLED) if action == "retry" else (State.QUEUED, State.RUNNING)
     return [
@@ -142,23 +120,6 @@ def _jobs_of(jobs: Jobs, pairs: Iterable[tuple[str, str]], action: str) -> list[
         for state in states
         for job in jobs.page(state=state, hand=hand, object=obj, limit=_CELLS_AT_ONCE).items
     ]
-
-
-def _apply_to_each(do: Callable[[Any], Any], wanted: Iterable[Any]) -> tuple[int, int]:
-    """Apply an action; return the numbers of successes and of refusals (because of owner or state)."""
-    done = left = 0
-    for one in wanted:
-        try:
-            do(one)
-            done += 1
-        except (ConflictError, ForeignResource):
-            left += 1
-    return done, left
-
-
-def _summary(action: str, done: int, left: int) -> str:
-    unchanged = f"; {left} unchanged: owned by another key, or not in a suitable state" if left else ""
-    return f"{done} {'job' if done == 1 else 'jobs'} {_DONE[action]}{unchanged}."
 
 
 def _render_datasets(
@@ -210,5 +171,5 @@ def compare_page(request: Request, datasets: DatasetsOf, one: Named = "", other:
         names=[dataset.name for dataset in datasets.page(limit=_OFFERED).items],
         chosen=(one, other),
         found=found,
-        metrics=[(*shown[metric], both, paired_bars(both)) for metric, both in found.metrics.items()] if found else [],
+        metrics=[(*shown[metric], both) for metric, both in found.metrics.items()] if found else [],
     )

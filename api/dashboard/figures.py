@@ -1,77 +1,15 @@
-"""Figures of the pages: charts as SVG without scripts, the hand x object matrix, and maps of failure."""
+"""Figures of the pages: the hand x object matrix, and maps of failure."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Final
-from urllib.parse import urlencode
 
-from graspd.api.models import Histogram
-from graspd.service.index.queries.statistics import Distribution
 from graspd.service.index.views import CellView, DatasetView, MatrixCell
 from graspd.service.model import studies
 from graspd.service.model.errors import DamagedError
 from graspd.service.model.states import State
 from graspd.service.store.records import STABILITY, latest_record
 from graspd.service.store.store import Store
-
-WIDTH: Final = 600.0
-HEIGHT: Final = 160.0
-
-
-@dataclass(frozen=True)
-class Bar:
-    x: float
-    y: float
-    width: float
-    height: float
-    count: int
-    low: float
-    high: float
-    href: str
-
-
-def minute_bars(values: Sequence[int], start: float) -> list[tuple[float, float, str]]:
-    """Return x, height and label of a bar for each minute from `start` [s since 1970]."""
-    top, width = max([*values, 1]), WIDTH / max(len(values), 1)
-    times = [datetime.fromtimestamp(start + 60 * i, UTC) for i in range(len(values))]
-    return [(i * width, HEIGHT * v / top, f"{times[i]:%H:%M} UTC: {v:,}") for i, v in enumerate(values)]
-
-
-def histogram_bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
-    """Return a histogram's bars, each with a link to its grasps.
-    The link leads to page `path` with the grasps in the bar's range that match `where`."""
-    width, top = (histogram.high - histogram.low) / len(histogram.counts), max(histogram.counts) or 1
-    made = []
-    for index, number in enumerate(histogram.counts):
-        low, high = histogram.low + index * width, histogram.low + (index + 1) * width
-        tall = max(60 * (number / top), 1.5 if number else 0)
-        query = where | {f"min_{histogram.metric}": f"{low:.6g}", f"max_{histogram.metric}": f"{high:.6g}"}
-        made.append(Bar(10.0 * index + 1, 63 - tall, 8.0, tall, number, low, high, f"{path}?{urlencode(query)}"))
-    return made
-
-
-@dataclass(frozen=True)
-class PairedBar:
-    x: float
-    one: float
-    other: float
-    low: float
-    high: float
-    shares: tuple[float, float]
-
-
-def paired_bars(both: Sequence[Distribution | None]) -> list[PairedBar]:
-    """Return the bins of two distributions over one range, as shares of each distribution's grasps."""
-    first = next(each for each in both if each is not None)
-    bins = len(first.counts)
-    shares = [[n / each.count for n in each.counts] if each is not None else [0.0] * bins for each in both]
-    most, width = max(map(max, shares)) or 1.0, (first.high - first.low) / bins
-    return [
-        PairedBar(10.0 * at, 60 * a / most, 60 * b / most, first.low + at * width, first.low + (at + 1) * width, (a, b))
-        for at, (a, b) in enumerate(zip(*shares, strict=True))
-    ]
-
 
 #: Steps of the colour scale; the style sheet has a class for each.
 STEPS: Final = 10
@@ -169,14 +107,6 @@ PITCH: Final = (40, 30)
 
 
 @dataclass(frozen=True)
-class CellSquare:
-    outcome: studies.Outcome
-    text: str
-    said: str
-    ringed: bool
-
-
-@dataclass(frozen=True)
 class Panel:
     """Panel of one method or family: rows from the top, columns from the left."""
 
@@ -184,33 +114,9 @@ class Panel:
     x: str
     y: str
     columns: list[str]
-    rows: list[tuple[str, list[CellSquare | None]]]
+    rows: list[tuple[str, list[studies.MapCell | None]]]
     line: str
     """Points of the theoretical boundary, over the cells."""
-
-    @property
-    def width(self) -> int:
-        return PITCH[0] * len(self.columns)
-
-    @property
-    def height(self) -> int:
-        return PITCH[1] * len(self.rows)
-
-
-@dataclass(frozen=True)
-class Share:
-    outcome: studies.Outcome
-    count: int
-    x: float
-    width: float
-
-
-@dataclass(frozen=True)
-class MapDrawing:
-    map: studies.StabilityMap
-    panels: list[Panel]
-    counts: dict[studies.Outcome, int]
-    reached: list[Share]
 
 
 def load_stability(store: Store) -> studies.Stability | None:
@@ -222,21 +128,10 @@ def load_stability(store: Store) -> studies.Stability | None:
         return None
 
 
-def draw_map(one: studies.StabilityMap) -> MapDrawing:
-    return MapDrawing(
-        map=one,
-        panels=[_panel(one, name) for name in one.panels],
-        counts={outcome: number for outcome, number in studies.count_outcomes(one.cells).items() if number},
-        reached=_outcome_shares(one.reached()),
-    )
-
-
-def _panel(one: studies.StabilityMap, name: str) -> Panel:
+def draw_panel(one: studies.StabilityMap, name: str) -> Panel:
     cells = one.panel_cells(name)
     xs, ys = ([*dict.fromkeys(getattr(cell, axis) for cell in cells)] for axis in ("x", "y"))
-    squares = {
-        (cell.x, cell.y): _cell_square(one, cell, ringed=one.is_partly_reachable and cell.reached) for cell in cells
-    }
+    squares = {(cell.x, cell.y): cell for cell in cells}
     line = one.lines.get(name, [])
     if any(isinstance(x, str) for x in xs):
         # Texts are labels of rows, because columns are narrow.
@@ -249,24 +144,3 @@ def _panel(one: studies.StabilityMap, name: str) -> Panel:
         for at_x, at_y in ((studies.tick_position(xs, x), studies.tick_position(ys, y)) for x, y in line)
     )
     return Panel(name, one.x, one.y, [studies.format_tick(x) for x in xs], rows, points)
-
-
-def _cell_square(one: studies.StabilityMap, cell: studies.MapCell, *, ringed: bool) -> CellSquare:
-    value = cell.note or (f"{cell.value:.3g}" if cell.value == cell.value else "no value")
-    return CellSquare(
-        outcome=cell.outcome,
-        text=cell.text,
-        said=f"{one.x} {studies.format_tick(cell.x)}, {one.y} {studies.format_tick(cell.y)}: {cell.outcome}; {value}",
-        ringed=ringed,
-    )
-
-
-def _outcome_shares(cells: Sequence[studies.MapCell]) -> list[Share]:
-    found = studies.count_outcomes(cells)
-    shares, x = [], 0.0
-    for outcome in studies.OUTCOMES:
-        if found[outcome]:
-            width = 100.0 * found[outcome] / len(cells)
-            shares.append(Share(outcome, found[outcome], x, width))
-            x += width
-    return shares

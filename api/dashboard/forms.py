@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shlex
-import threading
 import time
 from collections.abc import AsyncIterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Final
+from functools import lru_cache
+from typing import Any, Final, Literal
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
@@ -30,7 +30,6 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.options import FormField, OptionRow, option_rows
-from graspd.service.model.projects import ProjectScope
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.spec import Estimate, Matrix
@@ -113,14 +112,11 @@ async def submit(request: Request, jobs: JobsOf, assets: AssetsOf) -> HTMLRespon
         return await run(_submit, request, jobs, assets, fields)
 
 
-@router.post("/jobs/{job_id}/cancel", dependencies=SUBMIT)
-def cancel(job_id: str, jobs: JobsOf) -> RedirectResponse:
-    jobs.cancel(job_id)
-    return redirect(f"/jobs/{job_id}", "The job is cancelled; finished grasps remain.")
-
-
-@router.post("/jobs/{job_id}/retry", dependencies=SUBMIT)
-def retry(job_id: str, jobs: JobsOf) -> RedirectResponse:
+@router.post("/jobs/{job_id}/{action}", dependencies=SUBMIT)
+def act(job_id: str, action: Literal["cancel", "retry"], jobs: JobsOf) -> RedirectResponse:
+    if action == "cancel":
+        jobs.cancel(job_id)
+        return redirect(f"/jobs/{job_id}", "The job is cancelled; finished grasps remain.")
     jobs.retry(job_id)
     return redirect(f"/jobs/{job_id}", "Failed and cancelled tasks of the job run again.")
 
@@ -235,8 +231,7 @@ class FormEstimates:
 
     def __init__(self, index: Index) -> None:
         self._index = index
-        self._read: dict[tuple[Stage, ProjectScope], tuple[float, list[BatchCost]]] = {}
-        self._lock = threading.Lock()
+        self._read = lru_cache(maxsize=64)(lambda stage, scope, _: index.costs.batch_costs(stage, scope=scope))
 
     def estimate(self, form: Mapping[str, Any]) -> Estimate | None:
         """Return the estimate for a form; None while its values are invalid, or its fidelity is `auto`."""
@@ -248,8 +243,4 @@ class FormEstimates:
             return None
 
     def _costs(self, stage: Stage) -> list[BatchCost]:
-        with self._lock:
-            now, key = time.monotonic(), (stage, project_scope())
-            if key not in self._read or now - self._read[key][0] > KEPT_S:
-                self._read[key] = (now, self._index.costs.batch_costs(stage, scope=project_scope()))
-            return self._read[key][1]
+        return self._read(stage, project_scope(), time.monotonic() // KEPT_S)

@@ -16,7 +16,7 @@ from starlette.datastructures import FormData
 from graspd.api.catalog.facets import Facets
 from graspd.api.catalog.tags import Format, Tags
 from graspd.api.dashboard.forms import fields_of, first_message
-from graspd.api.dashboard.rendering import render
+from graspd.api.dashboard.rendering import redirect, render
 from graspd.api.formatting import metric as format_metric
 from graspd.api.models import GraspName, GraspQuery, Selection
 from graspd.api.routes.dependencies import READ, SUBMIT, ExportsOf, GraspsOf, ShardsOf, TagsOf, next_address
@@ -50,7 +50,6 @@ def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, tags: Tags
     # Forms send every field; the visible URL should be short.
     if len(given) < len(request.query_params):
         return RedirectResponse(_address(given), status_code=303)
-    said = action_summary(given)
     cursor, view = given.pop("cursor", None), given.pop("view", "cards")
     view = view if view in PAGE_SIZES else "cards"
     problem, page, facets, query = "", None, None, GraspQuery()
@@ -80,7 +79,6 @@ def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, tags: Tags
         chips=chips,
         address=partial(_address, shown),
         problem=problem,
-        did=said,
         **tag_choices(tags, rows, known, given),
         all_said="all that match the filters" if chips else "all grasps",
         here="/grasps",
@@ -169,7 +167,6 @@ def grasp_page(
         "grasp.html",
         page="/grasps",
         grasp=grasp,
-        did=action_summary(dict(request.query_params)),
         tags=[tag.name for tag in tags.all()],
         tagged=tags.names_by_grasp([(shard_id, row)]),
         similar=(similar := grasps.similar(grasp, SIMILAR)),
@@ -198,48 +195,28 @@ _LONGEST_FILTER: Final = 40_000
 _PAGES: Final = re.compile(r"/grasps(/[0-9a-f]{32}/[0-9]{1,10})?|/jobs/[0-9a-f]{32}")
 _NAME: Final[TypeAdapter[str]] = TypeAdapter(TagName)
 _FORMAT: Final[TypeAdapter[Format]] = TypeAdapter(Format)
-_DONE: Final = {"tagged": "{done} {grasps} tagged {tag}.", "untagged": "Tag {tag} removed from {done} {grasps}."}
 T = TypeVar("T")
 
 
 @router.post("/grasps/tag", dependencies=SUBMIT)
-def tag(tags: TagsOf, fields: Fields) -> RedirectResponse:
-    return _change_tag(tags, fields, on=True)
-
-
 @router.post("/grasps/untag", dependencies=SUBMIT)
-def untag(tags: TagsOf, fields: Fields) -> RedirectResponse:
-    return _change_tag(tags, fields, on=False)
+def change_tag(request: Request, tags: TagsOf, fields: Fields) -> RedirectResponse:
+    name, on = _validate(_NAME, fields.get("tag"), "tag"), request.url.path.endswith("/tag")
+    selection = _selection(fields)
+    change = tags.tag_grasps(name, selection) if on else tags.untag_grasps(name, selection)
+    grasps = f"{change.changed:,} {'grasp' if change.changed == 1 else 'grasps'}"
+    said = f"{grasps} tagged {name}." if on else f"Tag {name} removed from {grasps}."
+    here = str(fields.get("here", ""))
+    if _PAGES.fullmatch(here) and here != "/grasps":
+        return redirect(here, said)
+    view = {"view": str(fields["view"])} if fields.get("view") in ("table", "map") else {}
+    return redirect(_address(dict(_filter_fields(fields)) | view), said)
 
 
 @router.post("/grasps/export", dependencies=READ)
 async def export(request: Request, tags: TagsOf, exports: ExportsOf, fields: Fields) -> StreamingResponse:
     wanted = _validate(_FORMAT, fields.get("format") or "zip", "format")
     return await export_response(request, tags, exports, _selection(fields), wanted)
-
-
-def action_summary(given: dict[str, str]) -> str:
-    """Describe the result of the last action; remove the action's parameters from `given`."""
-    what, done, name = (given.pop(key, "") for key in ("did", "done", "named"))
-    if what not in _DONE or not (done.isascii() and done.isdigit()) or len(done) > 9:
-        return ""
-    try:
-        _NAME.validate_python(name)
-    except ValidationError:
-        return ""
-    return _DONE[what].format(done=f"{int(done):,}", grasps="grasp" if int(done) == 1 else "grasps", tag=name)
-
-
-def _change_tag(tags: Tags, fields: FormData, *, on: bool) -> RedirectResponse:
-    name = _validate(_NAME, fields.get("tag"), "tag")
-    selection = _selection(fields)
-    change = tags.tag_grasps(name, selection) if on else tags.untag_grasps(name, selection)
-    said = {"did": "tagged" if on else "untagged", "done": change.changed, "named": name}
-    here = str(fields.get("here", ""))
-    if _PAGES.fullmatch(here) and here != "/grasps":
-        return RedirectResponse(f"{here}?{urlencode(said)}", status_code=303)
-    view = {"view": str(fields["view"])} if fields.get("view") in ("table", "map") else {}
-    return RedirectResponse(f"/grasps?{urlencode(dict(_filter_fields(fields)) | view | said)}", status_code=303)
 
 
 def _selection(fields: FormData) -> Selection:

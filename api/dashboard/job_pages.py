@@ -11,8 +11,7 @@ from fastapi.responses import HTMLResponse
 from numpy.typing import NDArray
 from PIL import Image
 
-from graspd.api.dashboard import figures
-from graspd.api.dashboard.grasp_pages import COLUMNS, action_summary, tag_choices
+from graspd.api.dashboard.grasp_pages import COLUMNS, tag_choices
 from graspd.api.dashboard.rendering import render
 from graspd.api.models import GraspQuery, JobDetail
 from graspd.api.routes.dependencies import READ, GraspsOf, JobsOf, ShardsOf, TagsOf
@@ -51,14 +50,11 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         task_count=sum(stage.tasks for stage in job.stages),
         expected=jobs.estimate(job),
         cost=_cost_of(request.app.state.settings, job),
-        histograms=[
-            (*shown[data.metric], data, figures.histogram_bars(data, "/grasps", where))
-            for data in grasps.statistics(job)[0]
-        ],
+        histograms=[(*shown[name], name, data) for name, data in grasps.statistics(job)[0].items()],
+        where=where,
         pictures=pictures[:_SHOWN_PICTURES],
         picture_count=len(pictures),
         rows=rows,
-        did=action_summary(dict(request.query_params)),
         **tag_choices(tags, rows, tags.all(), where),
         all_said=f"all {'valid ' if validated else ''}grasps of this job",
         here=f"/jobs/{job_id}",
@@ -175,16 +171,14 @@ def paint_depth(depth: NDArray[Any]) -> NDArray[np.uint8]:
     if seen.any():
         low, high = np.percentile(depth[seen], (1, 99))
         place = np.clip((depth[seen] - low) / max(high - low, 1e-6), 0, 1) * (len(_DEPTH_COLOURS) - 1)
-        below = np.minimum(place.astype(int), len(_DEPTH_COLOURS) - 2)
-        share = (place - below)[:, None]
-        painted[seen] = _DEPTH_COLOURS[below] * (1 - share) + _DEPTH_COLOURS[below + 1] * share
+        steps = np.arange(len(_DEPTH_COLOURS))
+        painted[seen] = np.transpose([np.interp(place, steps, channel) for channel in _DEPTH_COLOURS.T])
     return painted
 
 
-def paint_segmentation(labels: NDArray[Any]) -> NDArray[np.uint8]:
-    """Colour labels (H, W) as (H, W, 3); neighbours beyond the palette share its last colour."""
-    return _CLASSES[np.minimum(labels, len(_CLASSES) - 1)]
-
-
 #: Functions that colour channels without colours.
-_PAINTERS: Final[dict[str, Callable[..., NDArray[Any]]]] = {"depth": paint_depth, "segmentation": paint_segmentation}
+_PAINTERS: Final[dict[str, Callable[..., NDArray[Any]]]] = {
+    "depth": paint_depth,
+    # Neighbours beyond the palette share its last colour.
+    "segmentation": lambda labels: _CLASSES[np.minimum(labels, len(_CLASSES) - 1)],
+}

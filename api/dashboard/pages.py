@@ -1,6 +1,5 @@
 """Pages of the service: home, workers, charts, failure maps, usage, deletions, problem types, session."""
 
-import time
 from collections import defaultdict
 from collections.abc import AsyncIterable
 from datetime import UTC, datetime, timedelta
@@ -14,27 +13,16 @@ from graspd.api.access.auth import SESSION_COOKIE, is_allowed
 from graspd.api.access.keys import SESSION_S, KeyFile, Scope
 from graspd.api.catalog import events
 from graspd.api.catalog.events import Webhooks
-from graspd.api.catalog.overview import MINUTES, Overview
-from graspd.api.dashboard import (
-    asset_pages,
-    dataset_pages,
-    figures,
-    forms,
-    grasp_pages,
-    job_list,
-    job_pages,
-    search,
-    tradeoff,
-)
+from graspd.api.dashboard import asset_pages, dataset_pages, figures, forms, grasp_pages, job_list, job_pages, tradeoff
 from graspd.api.dashboard.forms import FormEstimates
 from graspd.api.dashboard.job_pages import ShardPictures
 from graspd.api.dashboard.rendering import SEEN, environment, redirect, render, seen_end
-from graspd.api.models import STAGE_LABELS
+from graspd.api.problems import HTTP_PROBLEMS
 from graspd.api.routes import dependencies
 from graspd.api.routes.system import Since, Until
 from graspd.service.index.views import WorkerView
 from graspd.service.model.domain import METHODS
-from graspd.service.model.errors import ERRORS, InputError, UnavailableError
+from graspd.service.model.errors import ERRORS, InputError
 from graspd.service.model.webhooks import MAX_URL, End
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.records import What
@@ -54,8 +42,6 @@ router = APIRouter(include_in_schema=False)
 def home(
     request: Request, overview: dependencies.OverviewOf, jobs: dependencies.JobsOf, datasets: dependencies.DatasetsOf
 ) -> HTMLResponse:
-    minutes = overview.valid_per_minute()
-    start = time.time() // 60 * 60 - 60 * (MINUTES - 1)
     return render(
         request,
         "home.html",
@@ -63,10 +49,9 @@ def home(
         events="/events",
         refresh_s=5,
         stats=overview.stats(),
-        minutes=minutes,
-        pace=figures.minute_bars(minutes, start),
+        minutes=overview.valid_per_minute(),
         jobs=jobs.page(limit=_JOBS),
-        stages=stage_depths(overview),
+        stages=overview.waiting(),
         workers=[worker for worker in overview.workers() if is_recent(worker)],
         failures=overview.failures(),
         datasets=sorted(datasets.page(limit=_DATASETS).items, key=lambda dataset: dataset.state.is_final)[:4],
@@ -89,7 +74,7 @@ def workers_page(request: Request, overview: dependencies.OverviewOf, jobs: depe
         jobs={job_id: jobs.get_progress(job_id) for job_id in {task.job_id for task in tasks.values()}},
         busy=sum(worker.state == "busy" for worker in workers),
         alive=sum(worker.state != "lost" for worker in workers),
-        stages=stage_depths(overview),
+        stages=overview.waiting(),
         damage=overview.damage(),
     )
 
@@ -126,8 +111,16 @@ def chart_page(
 @router.get("/stability", dependencies=dependencies.READ)
 def stability_page(request: Request, store: dependencies.StoreOf) -> HTMLResponse:
     measured = figures.load_stability(store)
-    maps = [figures.draw_map(one) for one in measured.maps] if measured else []
-    return render(request, "stability.html", page="/engine", poll_s=_STUDY_S, measured=measured, maps=maps)
+    maps = measured.maps if measured else ()
+    return render(
+        request,
+        "stability.html",
+        page="/engine",
+        poll_s=_STUDY_S,
+        measured=measured,
+        maps=[(one, [figures.draw_panel(one, name) for name in one.panels]) for one in maps],
+        pitch=figures.PITCH,
+    )
 
 
 @router.get("/engine", dependencies=dependencies.READ)
@@ -194,18 +187,6 @@ def is_recent(worker: WorkerView) -> bool:
     """Check whether to show a worker; a lost worker is shown for 10 minutes."""
     age = datetime.now(UTC) - datetime.fromisoformat(worker.seen)
     return worker.state != "lost" or age < _LOST_SHOWN
-
-
-def stage_depths(overview: Overview) -> list[tuple[str, int]]:
-    """Return numbers of waiting tasks by stage; empty if Redis does not answer."""
-    try:
-        depths = overview.depths()
-    except UnavailableError:
-        return []
-    totals = dict.fromkeys(STAGE_LABELS, 0)
-    for (_, stage), waiting in depths.items():
-        totals[stage] += waiting
-    return [(STAGE_LABELS[stage], waiting) for stage, waiting in totals.items()]
 
 
 _SUMMED = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
@@ -292,7 +273,7 @@ def _redirect_to_deletions(id: str) -> RedirectResponse:
 
 routers: Final = (
     router,
-    search.router,
+    job_list.search_router,
     job_list.router,
     job_pages.router,
     grasp_pages.router,
@@ -324,19 +305,8 @@ def explorer(request: Request) -> HTMLResponse:
 @router.get("/problems/{slug}")
 def problem_types(request: Request, slug: str = "") -> HTMLResponse:
     types = [(name, error.status, (error.__doc__ or "").splitlines()[0]) for name, error in ERRORS.items()]
-    types += _HTTP_PROBLEMS
+    types += [(slug, status, meaning) for status, (slug, meaning) in HTTP_PROBLEMS.items()]
     return render(request, "problems.html", types=sorted(types, key=lambda row: (row[1], row[0])))
-
-
-_HTTP_PROBLEMS: Final = (
-    ("bad-request", 400, "The body or form cannot be read."),
-    ("unauthorized", 401, "A valid key is required."),
-    ("forbidden", 403, "The scope of the key is insufficient, or the request comes from another web site."),
-    ("method-not-allowed", 405, "The address does not support this method."),
-    ("unsupported-media-type", 415, "The body is compressed or otherwise encoded; send it unencoded."),
-    ("range-not-satisfiable", 416, "The byte range starts after the end of the file."),
-    ("misdirected-request", 421, "The service does not accept this host name while it has no keys."),
-)
 
 
 @router.get("/login")

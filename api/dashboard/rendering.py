@@ -31,7 +31,7 @@ NAVIGATION: Final = (
 #: Cookie with a message for the next page.
 _TOAST: Final = "graspd_toast"
 #: Parameters of pages that the API does not have.
-_NO_FILTERS: Final = ("view", "cursor", "did", "done", "named")
+_NO_FILTERS: Final = ("view", "cursor", "done")
 #: Cookie with the number of the last end of a job or dataset that the visitor has seen.
 SEEN: Final = "graspd_seen"
 MOST_UNREAD: Final = 100
@@ -62,7 +62,7 @@ def render(request: Request, template: str, *, status: int = 200, **context: Any
     context |= {
         "template": template,
         "path": request.url.path,
-        "query": {key: value for key, value in request.query_params.items() if value and key not in _NO_FILTERS},
+        "filters": {key: value for key, value in request.query_params.items() if value and key not in _NO_FILTERS},
         "base_url": base_url(request),
         "docs_url": request.app.state.settings.docs_url,
         "navigation": NAVIGATION if may_read else (),

@@ -12,8 +12,16 @@ from pydantic import Field
 from starlette.datastructures import UploadFile as AnyUpload
 
 from graspd.api.catalog.assets import Assets
-from graspd.api.problems import problem_responses
-from graspd.api.routes.dependencies import READ, SUBMIT, UPLOADS, AssetsOf, PagingOf, RequestLimiter, is_unmodified
+from graspd.api.routes.dependencies import (
+    READ,
+    SUBMIT,
+    UNCHANGED,
+    UPLOADS,
+    AssetsOf,
+    PagingOf,
+    RequestLimiter,
+    is_unmodified,
+)
 from graspd.api.uploads import files_of_upload, name_of_upload
 from graspd.service.index.views import AssetView, Page
 from graspd.service.model.base import Name
@@ -43,7 +51,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         """List all assets of this kind, newest first; refused ones only on request."""
         return paging.add_next_link(assets.page(kind, limit=paging.limit, cursor=paging.cursor, refused=refused))
 
-    @router.get("/{name}", dependencies=READ, responses=problem_responses(404), name=f"get_{kind}")
+    @router.get("/{name}", dependencies=READ, name=f"get_{kind}")
     def get_asset(name: str, assets: AssetsOf) -> AssetView:
         """Return an asset with the findings of its check."""
         return assets.get(kind, name)
@@ -55,7 +63,6 @@ def asset_router(kind: AssetKind) -> APIRouter:
         "",
         status_code=201 if kind is AssetKind.NETWORK else 202,
         dependencies=SUBMIT,
-        responses=problem_responses(400, 409),
         name=f"add_{kind}",
         description=_NETWORK if kind is AssetKind.NETWORK else _ZIPPED,
     )
@@ -81,9 +88,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
             response.headers["Retry-After"] = "1"
         return asset
 
-    @router.delete(
-        "/{name}", status_code=204, dependencies=SUBMIT, responses=problem_responses(404, 409), name=f"delete_{kind}"
-    )
+    @router.delete("/{name}", status_code=204, dependencies=SUBMIT, name=f"delete_{kind}")
     def delete_asset(name: str, assets: AssetsOf) -> None:
         """Delete an asset; refused while a job, dataset or set of objects needs it. `name` may be a digest."""
         assets.delete(kind, name)
@@ -96,13 +101,7 @@ def _add_model_route(router: APIRouter, kind: AssetKind) -> None:
         "/{name}/model",
         dependencies=READ,
         response_class=Response,
-        responses=problem_responses(
-            404,
-            others={
-                200: {"content": {_GLB: {}}, "description": "Binary glTF"},
-                304: {"description": "The file is unchanged: it has the tag of If-None-Match"},
-            },
-        ),
+        responses={200: {"content": {_GLB: {}}, "description": "Binary glTF"}, 304: {"description": UNCHANGED}},
         name=f"get_{kind}_model",
     )
     def get_model(name: str, request: Request, assets: AssetsOf) -> Response:
@@ -159,9 +158,7 @@ class CorrectionRequest(HandCorrections):
     name: Name | None = Field(None, description="name of the corrected hand; default: the hand's name with a number")
 
 
-@correction_router.post(
-    "/{name}/corrections", status_code=202, dependencies=SUBMIT, responses=problem_responses(400, 404, 409)
-)
+@correction_router.post("/{name}/corrections", status_code=202, dependencies=SUBMIT)
 async def correct_hand(
     name: str, body: CorrectionRequest, request: Request, response: Response, assets: AssetsOf
 ) -> AssetView:

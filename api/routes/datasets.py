@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
-from graspd.api.problems import ApiError, problem_responses
+from graspd.api.problems import ApiError
 from graspd.api.routes.dependencies import READ, SUBMIT, DatasetsOf, PagingOf
 from graspd.service.index.views import CellView, DatasetView, ObjectSetView, Page, SnapshotView
 from graspd.service.model.base import Name
@@ -33,7 +33,7 @@ class ObjectSetRequest(BaseModel):
     objects: Names = Field(min_length=1, max_length=100_000)
 
 
-@router.post("", status_code=202, dependencies=SUBMIT, responses=problem_responses(400, 404, 409, others=_ENDED))
+@router.post("", status_code=202, dependencies=SUBMIT, responses=_ENDED)
 def create_dataset(body: DatasetRequest, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Create a dataset. Identical content gives the same dataset; existing results are reused."""
     dataset = datasets.create(body)
@@ -42,7 +42,7 @@ def create_dataset(body: DatasetRequest, response: Response, datasets: DatasetsO
     return _with_location(dataset, response)
 
 
-@router.post("/estimate", dependencies=READ, responses=problem_responses(400, 404))
+@router.post("/estimate", dependencies=READ)
 def estimate_dataset(body: Matrix, datasets: DatasetsOf) -> Estimate:
     """Estimate a dataset's storage, and its time and traffic for 1, 8 and 64 workers. Nothing is recorded."""
     return datasets.estimate(body)
@@ -65,31 +65,31 @@ def list_datasets(datasets: DatasetsOf, paging: PagingOf) -> Page[DatasetView]:
     return paging.add_next_link(datasets.page(limit=paging.limit, cursor=paging.cursor))
 
 
-@router.get("/{name}", dependencies=READ, responses=problem_responses(404))
+@router.get("/{name}", dependencies=READ)
 def get_dataset(name: DatasetName, datasets: DatasetsOf) -> DatasetView:
     """Return a dataset's numbers: cells by state, grasps, progress, time, bytes."""
     return datasets.get(name)
 
 
-@router.get("/{name}/cells", dependencies=READ, responses=problem_responses(404))
+@router.get("/{name}/cells", dependencies=READ)
 def list_cells(name: DatasetName, datasets: DatasetsOf, paging: PagingOf, state: State | None = None) -> Page[CellView]:
     """List each cell (hand x object) with its job, state, yield and failures, ordered by hand."""
     return paging.add_next_link(datasets.cells(name, state=state, limit=paging.limit, cursor=paging.cursor))
 
 
-@router.post("/{name}/cancel", status_code=202, dependencies=SUBMIT, responses=problem_responses(404, 409))
+@router.post("/{name}/cancel", status_code=202, dependencies=SUBMIT)
 def cancel_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Cancel a dataset and its unfinished jobs; results remain, and jobs of other datasets continue."""
     return _with_location(datasets.cancel(name), response)
 
 
-@router.post("/{name}/retry", status_code=202, dependencies=SUBMIT, responses=problem_responses(404, 409))
+@router.post("/{name}/retry", status_code=202, dependencies=SUBMIT)
 def retry_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Restart failed and cancelled cells; existing results are not made again."""
     return _with_location(datasets.retry(name), response)
 
 
-@router.delete("/{name}", status_code=204, dependencies=SUBMIT, responses=problem_responses(404, 409))
+@router.delete("/{name}", status_code=204, dependencies=SUBMIT)
 def delete_dataset(
     name: DatasetName,
     datasets: DatasetsOf,
@@ -103,9 +103,7 @@ def delete_dataset(
     "/{name}/snapshots",
     status_code=201,
     dependencies=SUBMIT,
-    responses=problem_responses(
-        404, 409, others={200: {"model": SnapshotView, "description": "A snapshot of these shards existed already"}}
-    ),
+    responses={200: {"model": SnapshotView, "description": "A snapshot of these shards existed already"}},
 )
 def take_snapshot(name: DatasetName, response: Response, datasets: DatasetsOf) -> SnapshotView:
     """Record the dataset's present shards as a snapshot. The same shards give the same snapshot."""
@@ -116,19 +114,19 @@ def take_snapshot(name: DatasetName, response: Response, datasets: DatasetsOf) -
     return SnapshotView(**taken.model_dump(exclude={"shards", "version", "dataset_digest"}), shards=len(taken.shards))
 
 
-@router.get("/{name}/snapshots", dependencies=READ, responses=problem_responses(404))
+@router.get("/{name}/snapshots", dependencies=READ)
 def list_snapshots(name: DatasetName, datasets: DatasetsOf, paging: PagingOf) -> Page[SnapshotView]:
     """List snapshots of a dataset, newest first."""
     return paging.add_next_link(datasets.snapshots(name, limit=paging.limit, cursor=paging.cursor))
 
 
-@router.get("/{name}/snapshots/{digest}", dependencies=READ, responses=problem_responses(404))
+@router.get("/{name}/snapshots/{digest}", dependencies=READ)
 def get_snapshot(name: DatasetName, digest: SnapshotDigest, datasets: DatasetsOf) -> Snapshot:
     """Return a snapshot with its list of shards and their checksums."""
     return datasets.snapshot(name, digest)
 
 
-@sets_router.post("", status_code=201, dependencies=SUBMIT, responses=problem_responses(400, 404, 409))
+@sets_router.post("", status_code=201, dependencies=SUBMIT)
 def add_object_set(body: ObjectSetRequest, response: Response, datasets: DatasetsOf) -> ObjectSetView:
     """Name a set of objects. Its owner or an admin may store other objects as the set's next version."""
     found = datasets.add_object_set(body.name, body.objects)
@@ -142,7 +140,7 @@ def list_object_sets(datasets: DatasetsOf) -> list[ObjectSetView]:
     return datasets.object_sets()
 
 
-@sets_router.get("/{name}", dependencies=READ, responses=problem_responses(404))
+@sets_router.get("/{name}", dependencies=READ)
 def get_object_set(name: DatasetName, datasets: DatasetsOf) -> ObjectSetView:
     """Return the newest version of a set."""
     return datasets.object_set(name)

@@ -133,33 +133,26 @@ class RequestLimiter:
     """Pool of threads with a limited number of waiting requests."""
 
     def __init__(self, at_once: int, *, patience_s: float = _PATIENCE_S) -> None:
-        self._free = asyncio.Semaphore(at_once)
-        self._threads = CapacityLimiter(at_once)
-        self._waiting = 0
+        self._free = CapacityLimiter(at_once)
         self._patience_s = patience_s
 
     async def run(self, function: Callable[..., T], *args: Any, **options: Any) -> T:
         """Run a function in a thread of this pool; raise UnavailableError if none becomes free in time."""
-        await self._take()
-        try:
-            return await to_thread.run_sync(partial(function, *args, **options), limiter=self._threads)
-        finally:
-            self._free.release()
-
-    async def _take(self) -> None:
-        busy = UnavailableError("too many requests of this kind at once; try again in a moment")
-        if self._free.locked() and self._waiting >= _MOST_WAITING:
+        busy, turn = UnavailableError("too many requests of this kind at once; try again in a moment"), object()
+        if not self._free.available_tokens and self._free.statistics().tasks_waiting >= _MOST_WAITING:
             raise busy
-        self._waiting += 1
         try:
             async with asyncio.timeout(self._patience_s):
-                await self._free.acquire()
+                await self._free.acquire_on_behalf_of(turn)
         except TimeoutError:
             raise busy from None
+        try:
+            return await to_thread.run_sync(partial(function, *args, **options), limiter=CapacityLimiter(1))
         finally:
-            self._waiting -= 1
+            self._free.release_on_behalf_of(turn)
 
 
+UNCHANGED: Final = "The file is unchanged: it has the tag of If-None-Match"
 _TAGS: Final = re.compile(r'\s*((?:W/)?"[^"]*")\s*(?:,|$)')
 
 

@@ -15,14 +15,14 @@ router = APIRouter(prefix="/v1/grasps", tags=["grasps"])
 _KEPT = {"Cache-Control": "private, max-age=86400"}
 
 
-@router.get("/{shard_id}/{row}", dependencies=READ, responses=problem_responses(404))
+@router.get("/{shard_id}/{row}", dependencies=READ)
 def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> models.GraspDetail:
     """Return one grasp with its postures, and its metrics at every contact threshold."""
     response.headers.update(_KEPT)
     return grasps.get(shard_id, row)
 
 
-@router.get("/{shard_id}/{row}/replay", dependencies=READ, responses=problem_responses(404, 503))
+@router.get("/{shard_id}/{row}/replay", dependencies=READ)
 async def replay_grasp(request: Request, shard_id: str, row: int, grasps: GraspsOf) -> models.GraspReplay:
     """Simulate the validation of one grasp again; the API's machine needs the engine (`graspd[worker]`)."""
     found = await request.app.state.replays.run(grasps.replay, shard_id, row)
@@ -33,12 +33,8 @@ async def replay_grasp(request: Request, shard_id: str, row: int, grasps: Grasps
     "/export",
     dependencies=READ,
     response_class=StreamingResponse,
-    responses=problem_responses(
-        404,
-        413,
-        500,
-        others={200: {"content": {media: {} for media in MEDIA_TYPES.values()}, "description": "The file"}},
-    ),
+    responses=problem_responses(413, 500)
+    | {200: {"content": {media: {} for media in MEDIA_TYPES.values()}, "description": "The file"}},
 )
 async def export_grasps(
     request: Request, tags: TagsOf, exports: ExportsOf, query: Annotated[models.GraspExportQuery, Query()]
@@ -60,7 +56,7 @@ async def export_response(
     return StreamingResponse(chunks, media_type=MEDIA_TYPES[format], headers=headers)
 
 
-@router.get("", dependencies=READ, responses=problem_responses(404))
+@router.get("", dependencies=READ)
 def list_grasps(
     request: Request, response: Response, grasps: GraspsOf, query: Annotated[models.GraspPageQuery, Query()]
 ) -> Page[GraspView]:
@@ -80,25 +76,25 @@ def list_tags(tags: TagsOf) -> list[TagView]:
     return tags.all()
 
 
-@tag_router.post("", dependencies=SUBMIT, responses=problem_responses(400, 404, 409))
+@tag_router.post("", dependencies=SUBMIT)
 def give_tag(body: models.TagRequest, tags: TagsOf) -> models.TagChange:
     """Give a tag to listed or filtered grasps; create the tag if it is new."""
     return tags.tag_grasps(body.name, body)
 
 
-@tag_router.get("/{name}", dependencies=READ, responses=problem_responses(404))
+@tag_router.get("/{name}", dependencies=READ)
 def get_tag(name: TagName, tags: TagsOf) -> TagView:
     """Return a tag; `GET /v1/grasps?tag=NAME` lists its grasps."""
     return tags.get(name)
 
 
-@tag_router.post("/{name}/remove", dependencies=SUBMIT, responses=problem_responses(400, 404, 409))
+@tag_router.post("/{name}/remove", dependencies=SUBMIT)
 def remove_tag(name: TagName, body: models.Selection, tags: TagsOf) -> models.TagChange:
     """Remove a tag from listed or filtered grasps."""
     return tags.untag_grasps(name, body)
 
 
-@tag_router.delete("/{name}", status_code=204, dependencies=SUBMIT, responses=problem_responses(404, 409))
+@tag_router.delete("/{name}", status_code=204, dependencies=SUBMIT)
 def delete_tag(name: TagName, tags: TagsOf) -> None:
     """Delete a tag; its grasps remain."""
     tags.delete(name)

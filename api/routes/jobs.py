@@ -11,7 +11,16 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from graspd.api.catalog import events
 from graspd.api.models import Job, JobDetail, Shard
 from graspd.api.problems import ApiError, problem_responses
-from graspd.api.routes.dependencies import READ, SUBMIT, JobsOf, PagingOf, ShardsOf, is_unmodified, range_applies
+from graspd.api.routes.dependencies import (
+    READ,
+    SUBMIT,
+    UNCHANGED,
+    JobsOf,
+    PagingOf,
+    ShardsOf,
+    is_unmodified,
+    range_applies,
+)
 from graspd.service.index.views import Page
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.states import State
@@ -25,9 +34,7 @@ IdempotencyKey = Annotated[str | None, Header(max_length=255, description="the s
     "",
     status_code=202,
     dependencies=SUBMIT,
-    responses=problem_responses(
-        400, 404, 409, others={200: {"model": JobDetail, "description": "The job existed already and has ended"}}
-    ),
+    responses={200: {"model": JobDetail, "description": "The job existed already and has ended"}},
 )
 def submit(body: JobRequest, response: Response, jobs: JobsOf, idempotency_key: IdempotencyKey = None) -> JobDetail:
     """Submit a job. Identical content gives the same job: its id follows from request, hand and object."""
@@ -54,25 +61,25 @@ def list_jobs(
     return paging.add_next_link(page)
 
 
-@router.get("/{job_id}", dependencies=READ, responses=problem_responses(404))
+@router.get("/{job_id}", dependencies=READ)
 def get_job(job_id: str, jobs: JobsOf) -> JobDetail:
     """Return a job with the progress of its stages, failed attempts, mean metrics and shards."""
     return jobs.get(job_id)
 
 
-@router.post("/{job_id}/cancel", status_code=202, dependencies=SUBMIT, responses=problem_responses(404, 409))
+@router.post("/{job_id}/cancel", status_code=202, dependencies=SUBMIT)
 def cancel(job_id: str, jobs: JobsOf) -> JobDetail:
     """Cancel a job's waiting and running tasks; results remain."""
     return jobs.cancel(job_id)
 
 
-@router.post("/{job_id}/retry", status_code=202, dependencies=SUBMIT, responses=problem_responses(404, 409))
+@router.post("/{job_id}/retry", status_code=202, dependencies=SUBMIT)
 def retry(job_id: str, jobs: JobsOf) -> JobDetail:
     """Run failed and cancelled tasks again; existing results are not made again."""
     return jobs.retry(job_id)
 
 
-@router.delete("/{job_id}", status_code=204, dependencies=SUBMIT, responses=problem_responses(404, 409))
+@router.delete("/{job_id}", status_code=204, dependencies=SUBMIT)
 def delete(job_id: str, jobs: JobsOf) -> None:
     """Delete an ended job; `POST .../restore` restores it within the grace time."""
     jobs.delete(job_id)
@@ -83,12 +90,7 @@ def require_known_job(job_id: str, jobs: JobsOf) -> None:
     jobs.get_progress(job_id)
 
 
-@router.get(
-    "/{job_id}/events",
-    dependencies=[*READ, Depends(require_known_job)],
-    response_class=EventSourceResponse,
-    responses=problem_responses(404),
-)
+@router.get("/{job_id}/events", dependencies=[*READ, Depends(require_known_job)], response_class=EventSourceResponse)
 async def watch(job_id: str, request: Request, jobs: JobsOf) -> AsyncIterable[ServerSentEvent]:
     """Stream a job's progress: `progress` with the job at each change, `end` with its last state."""
     async for event in events.job_events(jobs, job_id, request):
@@ -102,7 +104,7 @@ _MEDIA_TYPE = "application/x-hdf5"
 _RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
 
-@shard_router.get("", dependencies=READ, responses=problem_responses(404))
+@shard_router.get("", dependencies=READ)
 def list_shards(
     shards: ShardsOf,
     paging: PagingOf,
@@ -113,7 +115,7 @@ def list_shards(
     return paging.add_next_link(shards.page(job=job, kind=kind, limit=paging.limit, cursor=paging.cursor))
 
 
-@shard_router.get("/{shard_id}", dependencies=READ, responses=problem_responses(404))
+@shard_router.get("/{shard_id}", dependencies=READ)
 def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
     """Return a shard with its whole manifest."""
     return shards.get(shard_id)
@@ -124,16 +126,13 @@ def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
     "/{shard_id}/file",
     dependencies=READ,
     response_class=StreamingResponse,
-    responses=problem_responses(
-        404,
-        416,
-        others={
-            200: {"content": {_MEDIA_TYPE: {}}, "description": "The file"},
-            206: {"content": {_MEDIA_TYPE: {}}, "description": "The requested bytes"},
-            304: {"description": "The file is unchanged: it has the tag of If-None-Match"},
-            307: {"description": "The store serves the file at a signed address"},
-        },
-    ),
+    responses=problem_responses(416)
+    | {
+        200: {"content": {_MEDIA_TYPE: {}}, "description": "The file"},
+        206: {"content": {_MEDIA_TYPE: {}}, "description": "The requested bytes"},
+        304: {"description": UNCHANGED},
+        307: {"description": "The store serves the file at a signed address"},
+    },
 )
 def get_file(shard_id: str, request: Request, shards: ShardsOf) -> Response:
     """Send the HDF5 file, or redirect to a signed address of the store. A damaged file is refused.

@@ -15,7 +15,6 @@ from graspd.api.catalog import events
 from graspd.api.catalog.overview import DeletionView, usage_csv
 from graspd.api.metrics import CONTENT_TYPE, Metrics
 from graspd.api.models import Health, Worker
-from graspd.api.problems import problem_responses
 from graspd.api.routes.dependencies import (
     READ,
     SUBMIT,
@@ -71,7 +70,7 @@ def readyz(request: Request, overview: OverviewOf, response: Response) -> Health
     "/metrics",
     dependencies=[Depends(require_metrics_access)],
     response_class=Response,
-    responses=problem_responses(others={200: {"content": {"text/plain": {}}}}),
+    responses={200: {"content": {"text/plain": {}}}},
 )
 def metrics(request: Request, overview: OverviewOf) -> Response:
     """Return metrics as Prometheus text. If a part is down, only its series are missing."""
@@ -94,7 +93,7 @@ Since = Annotated[Day | None, Query(description="first day (UTC); default: 30 da
 Until = Annotated[Day | None, Query(description="last day (UTC); default: today")]
 
 
-@usage_router.get("/v1/usage", dependencies=READ, responses=problem_responses(400))
+@usage_router.get("/v1/usage", dependencies=READ)
 def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[UsageDay]:
     """Return grasps and seconds per day of the key's project, newest first; with `admin`, of all projects."""
     return usage.days(since, until)
@@ -104,9 +103,7 @@ def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[
     "/v1/usage.csv",
     dependencies=READ,
     response_class=Response,
-    responses=problem_responses(
-        400, others={200: {"content": {"text/csv": {}}, "description": "One line per day and project"}}
-    ),
+    responses={200: {"content": {"text/csv": {}}, "description": "One line per day and project"}},
 )
 def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> Response:
     """Return the data of `/v1/usage` as CSV."""
@@ -126,12 +123,7 @@ def list_deletions(deletions: DeletionsOf) -> list[DeletionView]:
 
 
 def _add_restore(what: What) -> None:
-    @deletion_router.post(
-        f"/v1/{what}s/{{name}}/restore",
-        dependencies=SUBMIT,
-        responses=problem_responses(404, 409),
-        name=f"restore_{what}",
-    )
+    @deletion_router.post(f"/v1/{what}s/{{name}}/restore", dependencies=SUBMIT, name=f"restore_{what}")
     def restore(name: Name, deletions: DeletionsOf) -> DeletionView:
         """Restore a deleted resource unchanged, within the grace time (`GRASPD_SHARD_GRACE_S`)."""
         return deletions.restore(what, name)
@@ -189,7 +181,7 @@ async def stream_ends(
         yield event
 
 
-@event_router.post("/v1/webhooks", status_code=201, dependencies=SUBMIT, responses=problem_responses(400, 409))
+@event_router.post("/v1/webhooks", status_code=201, dependencies=SUBMIT)
 def add_webhook(body: WebhookRequest, response: Response, webhooks: WebhooksOf) -> CreatedWebhook:
     """Add a webhook for ended jobs and datasets of the key's project. The secret is shown only once."""
     hook, secret = webhooks.add(body.url, body.states)
@@ -203,15 +195,13 @@ def list_webhooks(webhooks: WebhooksOf) -> list[WebhookView]:
     return webhooks.all()
 
 
-@event_router.get("/v1/webhooks/{webhook_id}/deliveries", dependencies=SUBMIT, responses=problem_responses(404))
+@event_router.get("/v1/webhooks/{webhook_id}/deliveries", dependencies=SUBMIT)
 def list_deliveries(webhook_id: WebhookId, webhooks: WebhooksOf, limit: Limit = 50) -> list[DeliveryView]:
     """List deliveries of a webhook, newest first; stored for 30 days."""
     return webhooks.deliveries(webhook_id, limit=limit)
 
 
-@event_router.delete(
-    "/v1/webhooks/{webhook_id}", status_code=204, dependencies=SUBMIT, responses=problem_responses(404)
-)
+@event_router.delete("/v1/webhooks/{webhook_id}", status_code=204, dependencies=SUBMIT)
 def delete_webhook(webhook_id: WebhookId, webhooks: WebhooksOf) -> None:
     """Delete a webhook."""
     webhooks.delete(webhook_id)

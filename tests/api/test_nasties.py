@@ -10,16 +10,11 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
-from redis.exceptions import ConnectionError as RedisAway
 from starlette.testclient import TestClient
 
-from graspd.api.access.keys import Key, Scope
-from graspd.api.access.quotas import Quotas
 from graspd.api.middleware.limits import MAX_BODY_BYTES
-from graspd.service.model.errors import QuotaError
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
-from graspd.service.settings import Settings
 from graspd.service.store.library import load_asset, load_check
 from tests.api.factories import add_job, finish_all, zipped
 
@@ -127,22 +122,6 @@ def test_a_full_disk_is_told_and_a_retry_works(http: TestClient, where: str, mon
     assert answer.status_code == 503, answer.text
     assert answer.json()["type"] == "/problems/store-unavailable" and "space" in answer.json()["detail"]
     assert http.post("/v1/objects", files={"file": ("box.stl", STL)}).status_code == 202
-
-
-def test_redis_lost_in_the_middle_of_a_claim_forgets_no_job() -> None:
-    class Dropping:
-        calls = 0
-
-        def eval(self, *_: object) -> list[bytes]:
-            self.calls += 1
-            if self.calls == 2:
-                raise RedisAway("gone")
-            return [b"grasps", b"7"]
-
-    quotas = Quotas(Settings(quota_grasps_in_flight=10), Dropping(), lambda ids: set(ids))
-    key = Key(name="k", scope=Scope.SUBMIT, sha256="0" * 64, created="2026-01-01T00:00:00Z")
-    with pytest.raises(QuotaError, match="has 7 grasps in unfinished jobs"), quotas.claim(key, "j", 5):
-        pass
 
 
 #: What the service or its libraries read.

@@ -18,7 +18,6 @@ export class DistanceField {
   constructor(geometry) {
     const at = geometry.getAttribute("position").array;
     const index = geometry.index.array;
-    this.cell = FIELD_M;
     this.cells = new Map();
     for (let t = 0; t < index.length; t += 3) {
       const [a, b, c] = [0, 1, 2].map((k) => new Vector3().fromArray(at, 3 * index[t + k]));
@@ -34,7 +33,7 @@ export class DistanceField {
   distance(point) {
     let best = Infinity;
     const closest = new Vector3(), away = new Vector3(), side = new Vector3();
-    const [i, j, k] = [point.x, point.y, point.z].map((value) => Math.floor(value / this.cell));
+    const [i, j, k] = [point.x, point.y, point.z].map((value) => Math.floor(value / FIELD_M));
     for (const face of this.cells.get(key(i, j, k)) ?? []) {
       const weight = closestOnTriangle(point, face, closest);
       const distance = closest.distanceTo(point);
@@ -52,9 +51,8 @@ export class DistanceField {
   }
 
   #insert(face) {
-    const corners = [face.a, face.b, face.c];
-    const reach = (axis) => [Math.min(...corners.map((p) => p[axis])) - FIELD_M, Math.max(...corners.map((p) => p[axis])) + FIELD_M].map((v) => Math.floor(v / this.cell));
-    const [x, y, z] = ["x", "y", "z"].map(reach);
+    const end = (axis, way) => Math.floor(way * (Math.max(...[face.a, face.b, face.c].map((p) => way * p[axis])) + FIELD_M) / FIELD_M);
+    const [x, y, z] = ["x", "y", "z"].map((axis) => [end(axis, -1), end(axis, 1)]);
     for (let i = x[0]; i <= x[1]; i++) {
       for (let j = y[0]; j <= y[1]; j++) {
         for (let k = z[0]; k <= z[1]; k++) {
@@ -91,13 +89,10 @@ function closestOnTriangle(p, { a, b, c, ab, ac }, out) {
 }
 
 function colourOf(distance, out) {
-  const last = STOPS.length - 1;
-  if (distance <= STOPS[0][0]) return out.set(STOPS[0][1]);
-  for (let i = 0; i < last; i++) {
-    const [low, first] = STOPS[i], [high, second] = STOPS[i + 1];
-    if (distance <= high) return out.set(first).lerp(new Color(second), (distance - low) / (high - low));
-  }
-  return out.set(STOPS[last][1]);
+  const k = STOPS.findIndex(([limit]) => distance <= limit);
+  if (k < 1) return out.set(STOPS.at(k)[1]); // below the first one, or above the last one
+  const [low, first] = STOPS[k - 1], [high, second] = STOPS[k];
+  return out.set(first).lerp(new Color(second), (distance - low) / (high - low));
 }
 
 /** Dots on the hand near the object, in the object's frame. */
@@ -107,8 +102,7 @@ export class Contacts {
     // Points are relative to the mesh, because numbers have 32 bits and the object's origin may be far away.
     this.frame = thing.mesh;
     this.field = new DistanceField(thing.geometry);
-    let count = 0;
-    hand.eachPoint(this.frame, () => { count += 1; });
+    const count = hand.bodies.reduce((sum, { points }) => sum + (points?.length ?? 0) / 3, 0);
     const dot = new SphereGeometry(DOT_M, 8, 6);
     this.dots = new InstancedMesh(dot, new MeshBasicMaterial(), count);
     this.dots.instanceMatrix.setUsage(DynamicDrawUsage);

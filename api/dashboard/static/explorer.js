@@ -1,10 +1,7 @@
 // API explorer: Swagger UI of the service's OpenAPI document, in the colour scheme of the browser.
 (() => {
   "use strict";
-  const dark = matchMedia("(prefers-color-scheme: dark)");
-  const paint = () => document.documentElement.classList.toggle("dark-mode", dark.matches);
-  dark.addEventListener("change", paint);
-  paint();
+  document.documentElement.classList.toggle("dark-mode", matchMedia("(prefers-color-scheme: dark)").matches);
   SwaggerUIBundle({
     url: document.getElementById("explorer").dataset.document,
     dom_id: "#explorer",

@@ -7,19 +7,17 @@ function material(color) {
   return new MeshStandardMaterial({ color, roughness: 0.58, metalness: 0 });
 }
 
-function glass(looks, on) {
-  for (const look of looks) {
-    look.transparent = on;
-    look.opacity = on ? 0.32 : 1;
-    look.depthWrite = !on;
-    look.needsUpdate = true;
-  }
-}
-
 function solid(geometry, look) {
   const mesh = new Mesh(geometry, look);
   mesh.castShadow = mesh.receiveShadow = true;
   return mesh;
+}
+
+/** Move an object to a pose x y z [m], quaternion w x y z. */
+export function place(thing, [x, y, z, w, i, j, k]) {
+  thing.position.set(x, y, z);
+  thing.quaternion.set(i, j, k, w).normalize();
+  return thing;
 }
 
 /** Hand: `pose` moves its links; `group` is the drawing. */
@@ -58,9 +56,7 @@ export class Hand {
 
   /** Set a posture: pose of the root link, and joint positions by name [rad or m]. */
   pose(rootPose, positions) {
-    const [x, y, z, qw, qx, qy, qz] = rootPose;
-    this.group.position.set(x, y, z);
-    this.group.quaternion.set(qx, qy, qz, qw);
+    place(this.group, rootPose);
     const turn = new Quaternion();
     for (const [name, joint] of this.joints) {
       const value = positions[name] ?? 0;
@@ -73,14 +69,9 @@ export class Hand {
     this.group.updateMatrixWorld(true);
   }
 
-  /** Make the hand transparent. */
-  setGlass(on) {
-    glass(this.looks, on);
-  }
-
-  /** Make the root body transparent. */
-  setHousingGlass(on) {
-    glass(this.housing, on);
+  /** Make the hand transparent, or only `housing`, the materials of its root body. */
+  setGlass(on, looks = this.looks) {
+    for (const look of looks) Object.assign(look, { transparent: on, opacity: on ? 0.32 : 1, depthWrite: !on, needsUpdate: true });
   }
 
   /** Show collision shapes instead of visual meshes. */
@@ -104,7 +95,7 @@ export class Hand {
   }
 }
 
-/** Object with its `mesh` at the pose in the model; `setWire` shows triangles. */
+/** Object with its `mesh` at the pose in the model. */
 export class Thing {
   constructor(model) {
     this.geometry = model.nodes[0].solid;
@@ -114,10 +105,14 @@ export class Thing {
     this.group = new Group();
     this.group.add(this.mesh);
   }
+}
 
-  setWire(on) {
-    this.look.wireframe = on;
-  }
+/** Hand in its pre-shape, or object, of a model. */
+export function figureOf(model) {
+  if (model.extras.kind !== "hand") return new Thing(model);
+  const hand = new Hand(model);
+  hand.pose([0, 0, 0, 1, 0, 0, 0], model.extras.preshape);
+  return hand;
 }
 
 /** Interpolate two poses, 0 to 1: linear for the position, slerp for the rotation. */

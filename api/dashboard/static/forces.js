@@ -12,7 +12,6 @@ export class Forces {
     const sizes = way.points.flatMap((point) => (point.contacts ?? []).map((one) => length(one.slice(6, 9))));
     this.scale = LONGEST_M / Math.max(...sizes, 1);
     this.group = new Group();
-    this.arrows = [];
   }
 
   show(point) {
@@ -20,19 +19,12 @@ export class Forces {
       ["normal", [x, y, z], [nx, ny, nz], NORMAL_M],
       ["force", [x, y, z], [fx, fy, fz], this.scale * length([fx, fy, fz])],
     ]).filter(([, , , size]) => size > LEAST_N * this.scale);
-    while (this.arrows.length < drawn.length) {
-      const made = { force: new Arrow(COLOURS.force), normal: new Arrow(COLOURS.normal) };
-      this.arrows.push(made);
-      this.group.add(made.force.group, made.normal.group);
+    this.group.clear();
+    for (const [kind, at, along, size] of drawn) {
+      const arrow = new Arrow(COLOURS[kind]);
+      arrow.place(new Vector3(...at), new Vector3(...along).normalize(), size);
+      this.group.add(arrow.group);
     }
-    this.arrows.forEach((both, k) => {
-      for (const [kind, arrow] of Object.entries(both)) {
-        arrow.group.visible = drawn[k]?.[0] === kind;
-        if (!arrow.group.visible) continue;
-        const [, at, along, size] = drawn[k];
-        arrow.place(new Vector3(...at), new Vector3(...along).normalize(), size);
-      }
-    });
   }
 
   /** Fill the table of wrenches: forces of hand and supports, weight or push, what is left; sum of contact torques. */

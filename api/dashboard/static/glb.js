@@ -19,11 +19,7 @@ export function readGlb(buffer) {
     const width = WIDTHS[accessor.type];
     const stride = (span.byteStride ?? width * Type.BYTES_PER_ELEMENT) / Type.BYTES_PER_ELEMENT;
     const raw = new Type(buffer, base + span.byteOffset, accessor.count * stride);
-    if (stride === width) return new BufferAttribute(raw, width, accessor.normalized ?? false);
-    const packed = new Type(accessor.count * width);
-    for (let i = 0; i < accessor.count; i++) {
-      for (let k = 0; k < width; k++) packed[i * width + k] = raw[i * stride + k];
-    }
+    const packed = stride === width ? raw : raw.filter((_, i) => i % stride < width);
     return new BufferAttribute(packed, width, accessor.normalized ?? false);
   };
   const solid = (primitive) => {

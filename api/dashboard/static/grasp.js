@@ -2,12 +2,12 @@
 // slider along the trajectory, planned or replayed in MuJoCo. Several views turn and move together.
 import { Group, Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
-import { Hand, Thing } from "./figures.js";
+import { Hand, place, Thing } from "./figures.js";
 import { Contacts } from "./contacts.js";
 import { Forces } from "./forces.js";
 import { Arrow, AXES } from "./marks.js";
-import { freeSide, place, staged } from "./scenery.js";
-import { besideHand, LiveStage } from "./stage.js";
+import { freeSide, staged } from "./scenery.js";
+import { besideHand, LiveStage, startViewers } from "./stage.js";
 import { Way } from "./way.js";
 
 const STOP_MS = 1300;
@@ -148,7 +148,7 @@ class View {
       axes: (on) => { this.axes.visible = on; },
       glass: (on) => this.hand.setGlass(on),
       collision: (on) => this.hand.setCollision(on),
-      wire: (on) => this.thing.setWire(on),
+      wire: (on) => { this.thing.look.wireframe = on; },
       scenery: (on) => { this.scenery.group.visible = on; },
     };
     const [, numbers = "", at = "", names = ""] = location.hash.match(/^#view=([-\d.,]+);([\d.]+);([a-z,]*)$/) ?? [];
@@ -197,12 +197,6 @@ async function start(figure) {
   const view = new View(figure, ...(await Promise.all([json(grasp), loadGlb(hand), loadGlb(object)])));
   view.wire();
   views.push(view);
-  figure.dataset.state = "ready";
 }
 
-for (const figure of document.querySelectorAll("[data-viewer=grasp]")) {
-  start(figure).catch((error) => {
-    figure.dataset.state = "failed";
-    figure.querySelector("[data-say]").textContent = `No 3D view: ${error.message}. The page lists all numbers.`;
-  });
-}
+startViewers("grasp", start, "The page lists all numbers.");

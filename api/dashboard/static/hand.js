@@ -3,7 +3,7 @@ import { Box3, Quaternion, Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { Hand } from "./figures.js";
 import { Marks } from "./marks.js";
-import { beforePalm, LiveStage } from "./stage.js";
+import { beforePalm, LiveStage, startViewers } from "./stage.js";
 
 const ROOT = [0, 0, 0, 1, 0, 0, 0];
 /** Closed share of a hand on its approach; a gripper approaches open. */
@@ -179,7 +179,7 @@ class HandPage {
     }
     this.figure.querySelector("[data-close]").addEventListener("input", (event) => this.take(this.posture(Number(event.target.value))));
     const toggles = {
-      housing: (on) => this.hand.setHousingGlass(on),
+      housing: (on) => this.hand.setGlass(on, this.hand.housing),
       collision: (on) => this.hand.setCollision(on),
       marks: (on) => this.marks.setVisible(on),
     };
@@ -199,19 +199,9 @@ async function start(figure) {
   const model = await loadGlb(figure.dataset.model);
   if (!model.extras.facts) throw new Error("the model was made by an older version");
   figure.graspd = new HandPage(figure, document.getElementById("hand"), model);
-  figure.dataset.state = "ready";
 }
 
-function find() {
-  for (const figure of document.querySelectorAll("[data-viewer=hand][data-state=loading]")) {
-    figure.dataset.state = "reading";
-    start(figure).catch((error) => {
-      figure.dataset.state = "failed";
-      figure.querySelector("[data-say]").textContent = `No 3D view: ${error.message}. The form lists all settings.`;
-    });
-  }
-}
-
+const find = () => startViewers("hand", start, "The form lists all settings.");
 find();
 // The page shows the hand when its check has ended.
 document.addEventListener("graspd:swapped", find);

@@ -36,7 +36,6 @@
       region.replaceWith(document.adoptNode(next));
       const shown = document.getElementById(next.id);
       shown.dataset.was = was;
-      showCopies(shown);
       if (focused) twin(shown, focused)?.focus();
       changed = true;
     }
@@ -73,10 +72,6 @@
     }, () => {});
   });
 
-  function showCopies(root) {
-    for (const button of root.querySelectorAll("button[data-copy]")) button.hidden = false;
-  }
-
   // Command palette and keyboard shortcuts; a link has its key in `aria-keyshortcuts`.
   const palette = document.getElementById("palette"), single = document.getElementById("single-keys");
   let asked = 0;
@@ -111,7 +106,6 @@
     document.querySelector("[data-opens]").addEventListener("click", (event) => { event.preventDefault(); open("palette"); });
   }
 
-  showCopies(document);
   sayTimes(document);
   setInterval(() => sayTimes(document), 15000);
   document.addEventListener("htmx:after:swap", () => sayTimes(document));

@@ -10,13 +10,15 @@ const Z = new Vector3(0, 0, 1);
 const PROFILE = [[0, 0], [0.03, 0], [0.03, 0.72], [0.09, 0.72], [0, 1]].map(([radius, height]) => new Vector2(radius, height));
 const ARROW = new LatheGeometry(PROFILE, SIDES).rotateX(Math.PI / 2);
 
-/** Arrow that shines faintly through objects in front of it. */
+const looks = new Map();
+
+/** Arrow that shines faintly through objects in front of it; arrows of one colour share their materials. */
 export class Arrow {
   constructor(color) {
-    this.group = new Group();
-    const faint = new Mesh(ARROW, new MeshBasicMaterial({ color, transparent: true, opacity: 0.3, depthTest: false }));
-    faint.renderOrder = 3;
-    this.group.add(new Mesh(ARROW, new MeshStandardMaterial({ color, roughness: 0.5 })), faint);
+    const faded = { color, transparent: true, opacity: 0.3, depthTest: false };
+    if (!looks.has(color)) looks.set(color, [new MeshStandardMaterial({ color, roughness: 0.5 }), new MeshBasicMaterial(faded)]);
+    this.group = new Group().add(...looks.get(color).map((look) => new Mesh(ARROW, look)));
+    this.group.children[1].renderOrder = 3;
   }
 
   place(from, direction, length) {

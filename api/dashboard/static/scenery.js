@@ -1,7 +1,7 @@
 // Surroundings of an object: tables, walls, boards, other objects; viewpoints with a free view of the object.
 import { BoxGeometry, CircleGeometry, Group, Mesh, MeshStandardMaterial, Quaternion, Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
-import { Thing } from "./figures.js";
+import { place, Thing } from "./figures.js";
 
 /** Radius of the disc that shows a half-space [m]. */
 const DISC_M = 0.32;
@@ -29,13 +29,6 @@ function box({ size, pose }) {
   made.receiveShadow = true;
   made.renderOrder = 1;
   return made;
-}
-
-/** Move an object to a pose x y z [m], quaternion w x y z. */
-export function place(thing, [x, y, z, w, i, j, k]) {
-  thing.position.set(x, y, z);
-  thing.quaternion.set(i, j, k, w).normalize();
-  return thing;
 }
 
 /** Supports and neighbours of a scene. */

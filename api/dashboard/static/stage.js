@@ -15,8 +15,7 @@ function lit(scene) {
   const key = new DirectionalLight(0xfff6ea, 1.9);
   key.castShadow = true;
   key.shadow.mapSize.set(1024, 1024);
-  key.shadow.bias = -0.0006;
-  key.shadow.normalBias = 0.0012;
+  Object.assign(key.shadow, { bias: -0.0006, normalBias: 0.0012 });
   const rim = new DirectionalLight(0xdbe9ff, 0.9);
   scene.add(key, key.target, rim, rim.target);
   return { key, rim };
@@ -27,8 +26,7 @@ export class Stage {
   constructor(canvas) {
     this.renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true, preserveDrawingBuffer: !canvas });
     this.renderer.toneMapping = NoToneMapping;
-    this.renderer.shadowMap.enabled = true;
-    this.renderer.shadowMap.type = PCFShadowMap;
+    Object.assign(this.renderer.shadowMap, { enabled: true, type: PCFShadowMap });
     this.scene = new Scene();
     this.lights = lit(this.scene);
     this.camera = new PerspectiveCamera(FIELD_DEG, 1, 0.01, 10);
@@ -43,8 +41,7 @@ export class Stage {
     const half = (Math.min(1, this.camera.aspect) * FIELD_DEG * Math.PI) / 360;
     const distance = (margin * this.sphere.radius) / Math.sin(half);
     this.camera.position.copy(direction).normalize().multiplyScalar(distance).add(this.sphere.center);
-    this.camera.near = distance / 50;
-    this.camera.far = distance * 10;
+    Object.assign(this.camera, { near: distance / 50, far: distance * 10 });
     this.camera.lookAt(this.sphere.center);
     this.camera.updateProjectionMatrix();
     this.light();
@@ -53,22 +50,15 @@ export class Stage {
   /** Move the lamps with the camera. */
   light() {
     const { center, radius } = this.sphere;
-    const right = new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 0);
-    const up = new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 1);
-    const back = this.camera.position.clone().sub(center).normalize();
-    const place = (lamp, x, y, z) => {
-      lamp.position.copy(center).addScaledVector(right, x * radius).addScaledVector(up, y * radius).addScaledVector(back, z * radius);
+    const place = (lamp, ...at) => { // in radii to the right, up and back
+      lamp.position.set(...at).multiplyScalar(radius).applyQuaternion(this.camera.quaternion).add(center);
       lamp.target.position.copy(center);
       lamp.target.updateMatrixWorld();
     };
     place(this.lights.key, -1.6, 2.6, 2.4);
     place(this.lights.rim, 2.2, 0.6, -2.2);
-    const eye = this.lights.key.shadow.camera;
-    eye.left = eye.bottom = -1.2 * radius;
-    eye.right = eye.top = 1.2 * radius;
-    eye.near = 0.1 * radius;
-    eye.far = 8 * radius;
-    eye.updateProjectionMatrix();
+    const side = 1.2 * radius, span = { left: -side, bottom: -side, right: side, top: side, near: 0.1 * radius, far: 8 * radius };
+    Object.assign(this.lights.key.shadow.camera, span).updateProjectionMatrix();
   }
 
   size(width, height, ratio) {
@@ -104,8 +94,7 @@ export class LiveStage extends Stage {
   frame(group, direction, margin) {
     super.frame(group, direction, margin);
     this.controls.target.copy(this.sphere.center);
-    this.controls.minDistance = this.sphere.radius * 0.4;
-    this.controls.maxDistance = this.sphere.radius * 12;
+    Object.assign(this.controls, { minDistance: this.sphere.radius * 0.4, maxDistance: this.sphere.radius * 12 });
     this.controls.update();
     this.home = this.view;
     this.invalidate();
@@ -158,11 +147,9 @@ export class LiveStage extends Stage {
     const zooms = { "+": 0.88, "=": 0.88, "-": 1.14 };
     const offset = this.camera.position.clone().sub(this.controls.target);
     if (turns[event.key]) {
-      const [around, over] = turns[event.key];
-      const radius = offset.length();
-      const polar = Math.min(Math.max(Math.acos(offset.z / radius) + over, 0.05), Math.PI - 0.05);
-      const azimuth = Math.atan2(offset.y, offset.x) + around;
-      offset.set(radius * Math.sin(polar) * Math.cos(azimuth), radius * Math.sin(polar) * Math.sin(azimuth), radius * Math.cos(polar));
+      const [around, over] = turns[event.key], { up } = this.camera, polar = offset.angleTo(up);
+      const tilt = Math.min(Math.max(polar + over, 0.05), Math.PI - 0.05) - polar;
+      offset.applyAxisAngle(up.clone().cross(offset).normalize(), tilt).applyAxisAngle(up, around);
     } else if (zooms[event.key]) {
       offset.multiplyScalar(zooms[event.key]);
     } else {
@@ -186,11 +173,23 @@ export function besideHand(hand) {
   return side.multiplyScalar(1).addScaledVector(up, 0.55).addScaledVector(approach, -0.35);
 }
 
-/** Viewing direction of the palm of a hand in its own frame. */
-export function beforePalm(hand) {
-  const approach = new Vector3(...hand.extras.palm.approach);
+/** Viewing direction of a hand's palm in its own frame, or of an object. */
+export function beforePalm({ extras }) {
+  if (!extras) return new Vector3(1, -1.5, 0.8);
+  const approach = new Vector3(...extras.palm.approach);
   const up = new Vector3(0, 0, 1);
   const side = new Vector3().crossVectors(up, approach);
   if (side.length() < 0.2) return new Vector3(1, -1.2, 0.55);
   return approach.addScaledVector(side.normalize(), 0.75).addScaledVector(up, 0.35);
+}
+
+/** Start the waiting viewers of a kind; the figure tells why one cannot start, and where its content is. */
+export function startViewers(kind, start, instead) {
+  for (const figure of document.querySelectorAll(`[data-viewer=${kind}][data-state=loading]`)) {
+    figure.dataset.state = "reading";
+    start(figure).then(() => { figure.dataset.state = "ready"; }, (error) => {
+      figure.dataset.state = "failed";
+      figure.querySelector("[data-say]").textContent = `No 3D view: ${error.message}. ${instead}`;
+    });
+  }
 }

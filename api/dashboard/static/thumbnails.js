@@ -1,7 +1,7 @@
 // Pictures of grasps, hands and objects in lists: one small stage draws each picture when it scrolls into view.
 import { Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
-import { between, Hand, Thing } from "./figures.js";
+import { between, figureOf, Hand, Thing } from "./figures.js";
 import { freeSide, staged } from "./scenery.js";
 import { beforePalm, besideHand, Stage } from "./stage.js";
 
@@ -29,15 +29,11 @@ function picture(canvas, shown, side, room) {
   canvas.dataset.state = "ready";
 }
 
-async function drawModel(canvas) {
-  const model = await loadGlb(canvas.dataset.model);
-  const made = model.extras.kind === "hand" ? new Hand(model) : new Thing(model);
-  if (made instanceof Hand) made.pose([0, 0, 0, 1, 0, 0, 0], model.extras.preshape);
-  picture(canvas, [made.group], made instanceof Hand ? beforePalm(made) : new Vector3(1, -1.5, 0.8), 0.9);
-}
-
 async function draw(canvas) {
-  if (canvas.dataset.model) return drawModel(canvas);
+  if (canvas.dataset.model) {
+    const made = figureOf(await loadGlb(canvas.dataset.model));
+    return picture(canvas, [made.group], beforePalm(made), 0.9);
+  }
   const [grasp, hand, thing] = await Promise.all([
     fetch(canvas.dataset.grasp).then((answer) => (answer.ok ? answer.json() : Promise.reject(new Error(answer.status)))),
     keep(canvas.dataset.hand, Hand),

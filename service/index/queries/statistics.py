@@ -23,6 +23,12 @@ class Distribution:
     high: float
     counts: list[int]
 
+    @property
+    def bins(self) -> list[tuple[float, float, int]]:
+        """Low end, high end and count of each bin."""
+        ends = np.linspace(self.low, self.high, len(self.counts) + 1).tolist()
+        return list(zip(ends, ends[1:], self.counts, strict=False))
+
 
 @dataclass(frozen=True)
 class GraspKinds:

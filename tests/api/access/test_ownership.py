@@ -149,7 +149,7 @@ def test_pages_show_a_button_only_to_whom_it_would_serve(ask: Ask, who: str, may
 def test_chosen_jobs_of_others_are_counted_as_left(ask: Ask) -> None:
     job = submitted(ask, "ann")
     chosen = {"action": "cancel", "cell": "allegro|mug"}
-    assert "0 jobs cancelled; 1 unchanged" in ask("bob", "POST", "/datasets/cells", data=chosen).text
+    assert "0 jobs cancelled. 1 unchanged" in ask("bob", "POST", "/datasets/cells", data=chosen).text
     assert ask("bob", "GET", f"/v1/jobs/{job}").json()["state"] == "queued"
 
 

@@ -77,6 +77,7 @@ class World:
         assert tag.status_code == 200, tag.text
         add_worker(self.services)
         self.said |= {"job_id": job, "failed": failed, "waiting": waiting, "shard_id": shard, "views": views}
+        self.said["task_id"] = next(task.id for task in plan_tasks(record))
         self.said |= {"digest": snapshot, "webhook": hook["id"], "webhook_secret": hook["secret"]}
 
     def ask(self, who: str, method: str, path: str, **content: Any) -> Any:
@@ -109,7 +110,12 @@ _URDF = b"""<robot name="two"><link name="base"/><link name="tip"/><joint name="
 _VALUES: dict[str, tuple[str, ...]] = (
     {"job_id": ("job_id", "failed", "waiting"), "shard_id": ("shard_id", "views"), "kind": ("object", "hand")}
     | {"digest": ("digest", "objects_digest"), "row": ("0",), "index": ("0",), "slug": ("not-found",)}
-    | {"webhook_id": ("webhook",), "action": ("cancel", "retry", "snapshot", "delete"), "what": ("object",)}
+    | {
+        "webhook_id": ("webhook",),
+        "task_id": ("task_id",),
+        "action": ("cancel", "retry", "snapshot", "delete"),
+        "what": ("object",),
+    }
 )
 _NAMES = {
     "hands": ("red-secret-hand", "hands_digest"),

@@ -1,20 +1,23 @@
 """Requests that come at once, to one API process or to two: what one of them may have, two do not get."""
 
+import time
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from threading import Barrier, BrokenBarrierError
+from threading import Barrier, BrokenBarrierError, Event
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from httpx import Response
 from pydantic import SecretStr
+from redis.exceptions import ConnectionError as RedisAway
 from starlette.testclient import TestClient
 
 from graspd.api.access.keys import Key, KeyFile, KeyLimits, Scope
 from graspd.api.access.quotas import Quotas
 from graspd.service.index.rebuild import differences
-from graspd.service.model.errors import QuotaError
+from graspd.service.model.errors import InputError, QuotaError
 from graspd.service.model.records import JobRecord, ObjectSet, create_object_set
 from graspd.service.model.webhooks import MOST_HOOKS
 from graspd.service.pipeline.backends import Services
@@ -52,7 +55,11 @@ def quotas(settings: Settings, rq_queue: RqQueue, noon: None) -> MakeQuotas:
 
 
 def held(rq_queue: RqQueue) -> int:
-    return int(rq_queue.connection.hget("graspd:quota:me:held", "grasps") or 0)
+    return sum(map(int, rq_queue.connection.hvals("graspd:quota:me:jobs")))
+
+
+def today(rq_queue: RqQueue) -> int:
+    return sum(int(rq_queue.connection.get(day)) for day in rq_queue.connection.scan_iter("graspd:quota:me:2*"))
 
 
 def test_thirty_jobs_at_once_over_two_apis_stay_within_the_quota(twins: list[TestClient]) -> None:
@@ -64,33 +71,35 @@ def test_thirty_jobs_at_once_over_two_apis_stay_within_the_quota(twins: list[Tes
     assert answers == [202] * 4 + [429] * 26
 
 
-def test_a_job_that_is_entered_or_retried_meanwhile_stays_counted(quotas: MakeQuotas, rq_queue: RqQueue) -> None:
-    one = quotas(lambda ids: set())
-    with one.claim(KEY, "a", 20), pytest.raises(QuotaError), one.claim(KEY, "b", 5):
-        pass
-    assert held(rq_queue) == 20
+def test_a_job_that_is_being_entered_stays_counted(quotas: MakeQuotas, rq_queue: RqQueue) -> None:
+    """A second submission waits for the first one, and then finds its job in the index."""
+    entered: set[str] = set()
+    is_inside = Event()
 
-    def retried_meanwhile(ids: Collection[str]) -> set[str]:
-        with one.claim(KEY, "a", 20, is_new=False):
+    def first() -> None:
+        with quotas(lambda ids: entered).claim(KEY, "a", 20):
+            is_inside.set()
+            time.sleep(0.2)
+            entered.add("a")
+
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(first)
+        assert is_inside.wait(60)
+        with pytest.raises(QuotaError), quotas(lambda ids: entered).claim(KEY, "b", 5):
             pass
-        return set()
-
-    with pytest.raises(QuotaError), quotas(retried_meanwhile).claim(KEY, "b", 5):
-        pass
+        done.result()
     assert held(rq_queue) == 20
 
 
 @pytest.mark.parametrize("made", [(True, False), (False, True), (False, False)])
 def test_of_two_claims_the_one_that_made_a_job_counts(quotas: MakeQuotas, rq_queue: RqQueue, made: list[bool]) -> None:
     one = quotas(set)
-    with one.claim(KEY, "a", 20) as first:
-        with one.claim(KEY, "a", 20) as second:
-            second.counts = made[1]
-        first.counts = made[0]
-    assert held(rq_queue) == (20 if any(made) else 0)
-    if any(made):
-        today = next(iter(rq_queue.connection.scan_iter("graspd:quota:me:2*")))
-        assert int(rq_queue.connection.get(today)) == 1
+    for counts in made:
+        with one.claim(KEY, "a", 20) as claim:
+            claim.counts = counts
+    with suppress(InputError), one.claim(KEY, "a", 20):
+        raise InputError("a claim of a known job that fails changes nothing")
+    assert (held(rq_queue), today(rq_queue)) == ((20, 1) if any(made) else (0, 0))
 
 
 def test_a_retry_of_fewer_grasps_leaves_the_sum_true(quotas: MakeQuotas, rq_queue: RqQueue) -> None:
@@ -100,20 +109,40 @@ def test_a_retry_of_fewer_grasps_leaves_the_sum_true(quotas: MakeQuotas, rq_queu
         pass
     with one.claim(KEY, "a", 5, is_new=False):
         pass
+    assert held(rq_queue) == 20
     ended.add("a")
     with one.claim(KEY, "b", 5):
         pass
-    assert held(rq_queue) == 5
+    assert (held(rq_queue), today(rq_queue)) == (5, 2)
 
 
 def test_a_claim_of_a_dead_process_ends(quotas: MakeQuotas, rq_queue: RqQueue, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("graspd.api.access.quotas._PENDING_S", 0)
+    monkeypatch.setattr("graspd.api.access.quotas._LOCKED_S", 0.2)
     one = quotas(lambda ids: set())
     died = one.claim(KEY, "a", 20)
     died.__enter__()
+    monkeypatch.setattr("graspd.api.access.quotas._PATIENCE_S", 0.05)
+    with pytest.raises(QuotaError, match="at once"), one.claim(KEY, "b", 5):
+        pass
+    time.sleep(0.2)
     with one.claim(KEY, "b", 5):
         pass
     assert held(rq_queue) == 5
+
+
+@pytest.mark.parametrize("step", ["lock", "hexists", "hgetall", "pipeline", "hdel"])
+def test_redis_that_goes_at_any_step_refuses_no_job(
+    quotas: MakeQuotas, rq_queue: RqQueue, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    one = quotas(lambda ids: set())
+    rq_queue.connection.hset("graspd:quota:me:jobs", "ended", 20)
+    with monkeypatch.context() as patch:
+        patch.setattr(rq_queue.connection, step, Mock(side_effect=RedisAway("gone")))
+        with one.claim(KEY, "a", 5) as claim:
+            claim.counts = False
+    with one.claim(KEY, "b", 20):
+        pass
+    assert (held(rq_queue), today(rq_queue)) == (20, 1)
 
 
 @pytest.mark.parametrize("refused", [{"object": "unheard-of"}, {"grasps": 21}])

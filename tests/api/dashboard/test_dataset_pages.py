@@ -62,7 +62,7 @@ def test_chosen_pairs_are_cancelled_and_retried(http: TestClient, services: Serv
     pairs = ["allegro|mug", "allegro|block"]
     assert "1 job cancelled." in http.post("/datasets/cells", data={"action": "cancel", "cell": pairs}).text
     assert services.index.jobs.get(waiting.id).state is State.CANCELLED
-    assert "2 jobs retried." in http.post("/datasets/cells", data={"action": "retry", "cell": pairs}).text
+    assert "2 jobs queued again." in http.post("/datasets/cells", data={"action": "retry", "cell": pairs}).text
     assert services.index.jobs.get(failed.id).state is State.QUEUED
 
 

@@ -101,11 +101,11 @@ def test_forms_tag_chosen_grasps_and_lead_back_to_the_list(http: TestClient, ser
 
     filters = {"filter": f"job={record.id}&valid=false", "here": "/grasps", "view": "table"}
     back = does("tag", grasp=[f"{shard}:1", f"{shard}:2"], **filters)
-    assert back == f"/grasps?job={record.id}&valid=false&view=table&did=tagged&done=2&named=good"
+    assert back == f"/grasps?job={record.id}&valid=false&view=table"
     assert "2 grasps tagged good." in http.get(back).text
-    assert does("untag", all="true", filter="tag=good", here=f"/jobs/{record.id}").startswith(f"/jobs/{record.id}?did=")
+    assert does("untag", all="true", filter="tag=good", here=f"/jobs/{record.id}") == f"/jobs/{record.id}"
     # What a form says of where it stands leads nowhere else; and a form that chooses nothing says so.
-    assert does("tag", grasp=f"{shard}:1", here="//example.org").startswith("/grasps?")
+    assert does("tag", grasp=f"{shard}:1", here="//example.org") == "/grasps"
     assert does("tag") == does("tag", all="true", filter="job=none") == does("export", grasp="../../x:1") == "422"
     assert "no grasp is selected" in http.post("/grasps/tag", data={"tag": "good"}).text
     long = {"tag": "good", "all": "true", "filter": "x" * 40_001}
@@ -116,7 +116,6 @@ def test_forms_tag_chosen_grasps_and_lead_back_to_the_list(http: TestClient, ser
     gone = http.post("/tags/good/delete", data={"typed": "good"})
     assert gone.url.path == "/deleted" and "The tag good is deleted." in gone.text
     assert http.post("/deleted/tag/good/restore").url.path == "/grasps"
-    assert "<script>" not in http.get("/grasps?did=tagged&done=1&named=<script>").text
 
 
 def test_the_address_of_a_list_holds_its_filter_and_no_empty_fields(http: TestClient) -> None:

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import re
 from typing import Any
 
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
-from graspd.api.dashboard.figures import PITCH, draw_map
+from graspd.api.dashboard.figures import PITCH, draw_panel
 from graspd.api.dashboard.tradeoff import HEIGHT, WIDTH, PublishedChart, draw_chart
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.studies import FILTERED, IN_SCENE, MapCell, Outcome, Stability, StabilityMap, pareto_front
@@ -142,23 +143,21 @@ def a_record(created: str = "2026-11-21T12:00:00.000Z", **changes: object) -> di
 
 def test_small_values_are_at_the_left_and_at_the_bottom() -> None:
     """A cell that was not measured is left open; the bound of theory goes through the middles of its cells."""
-    (panel,) = draw_map(a_map()).panels
+    panel = draw_panel(a_map(), "penalty")
     assert panel.columns == ["100", "1000", "1e4"]
     assert [name for name, _ in panel.rows] == ["0.01", "1e-4"]
     assert [square.outcome for square in panel.rows[0][1] if square] == ["good", "weak", "broken"]
     width, height = PITCH
     first, last = (tuple(map(float, point.split(","))) for point in panel.line.split())
     assert (first, last) == ((width / 2, height / 2), (2.5 * width, 1.5 * height))
-    (open_one,) = draw_map(a_map(cells=a_map().cells[:-1])).panels
+    open_one = draw_panel(a_map(cells=a_map().cells[:-1]), "penalty")
     assert open_one.rows[0][1][2] is None
-    shares = [(share.outcome, share.count, share.x, share.width) for share in draw_map(a_map()).reached]
-    assert shares == [("good", 2, 0.0, 50.0), ("weak", 2, 50.0, 50.0)]
 
 
 def test_words_along_the_bottom_stand_before_rows_instead() -> None:
     pairs = [(name, fidelity) for name in ("open", "inside out") for fidelity in ("draft", "fine")]
     cells = [MapCell("mesh", name, fidelity, 1.0, "good") for name, fidelity in pairs]
-    (panel,) = draw_map(a_map(cells=cells, lines={})).panels
+    panel = draw_panel(a_map(cells=cells, lines={}), "mesh")
     assert (panel.columns, [name for name, _ in panel.rows]) == (["draft", "fine"], ["open", "inside out"])
     assert (panel.x, panel.y) == ("time step [s]", "stiffness [N/m]")
 
@@ -169,5 +168,7 @@ def test_the_page_shows_the_latest_maps_and_what_they_mean(http: TestClient, ser
     page = http.get("/stability").text
     assert "A map of stiffness" in page and "an older measure" not in page
     shown = ("energy", "weak: 1.02", "hands sink in", "direct has none", "tests/test_it.py::test_it", "the soft ones")
+    shares = re.findall(r'<rect class="(good|weak)" x="([0-9])" width="([0-9])"', page)
+    assert shares == [("good", "0", "2"), ("weak", "2", "2")]
     cells = ("mesh inside out (fine)", "time step [s] 0.01: broken; note 4", "graspd stability")
     assert [words for words in shown + cells if words not in page] == []
