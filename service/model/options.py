@@ -59,10 +59,6 @@ class OptionRow:
     option: Option
 
     @property
-    def form(self) -> FormField | None:
-        return next((one for one in self.field.metadata if isinstance(one, FormField)), None)
-
-    @property
     def flags(self) -> list[str]:
         return self.option.flags.split() or [f"--{self.name.replace('_', '-')}"]
 
