@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json as jsonlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from graspd.exchange.opening import check_written_files
 from graspd.exchange.plan import ExportSummary
-from graspd.service.cli import CommandGroup, DataDir, JsonFlag, load_settings, plain_console, print_result
+from graspd.service.cli import CommandGroup, DataDir, JsonFlag, load_settings, print_result, progress_bar
 from graspd.service.model.errors import InputError, choices_text
 from graspd.service.store import validity
 from graspd.service.store.shards import read_shard
@@ -254,9 +252,9 @@ def card(
     from graspd.studies.cards.card import write_card
 
     contents = _contents(source, snapshot, assets, data_dir)
-    with _progress(json=json) as report:
+    with progress_bar(quiet=json) as report:
         found = write_card(
-            contents, out, licence=licence, source=text, progress=lambda done, total: report("shards", done, total)
+            contents, out, licence=licence, source=text, progress=lambda done, total: report(done, total, "shards")
         )
     made = found["composition"]
     told = {"out": str(out), "dataset": found["name"], "snapshot": (found["snapshot"] or {}).get("digest")}
@@ -296,7 +294,7 @@ def publish(
     folder = Path(hub.repository.split("/")[1] if hub else to)
     contents = _contents(source, snapshot, assets, data_dir)
     options = PublicationOptions(licence, text, every, held_out, tars, accept)
-    with _progress(json=json) as report:
+    with progress_bar(quiet=json) as report:
         write_publication(contents, folder, options, report, name=hub.repository if hub else "")
     address = hub.upload(folder, public=public) if hub else ""
     files = sorted(str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file())
@@ -315,13 +313,3 @@ def _contents(source: str, snapshot: str | None, assets: Path | None, data_dir: 
         store = open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False)
         contents = contents_of_store(store, source, snapshot)
     return contents if assets is None else add_provenance(contents, assets)
-
-
-@contextmanager
-def _progress(*, json: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Show the current step with its finished and all parts."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = plain_console(stderr=True)
-    with Progress(*columns, console=console, disable=json or not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("")
-        yield lambda step, done, total: bar.update(task, description=step, completed=done, total=total)

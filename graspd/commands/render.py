@@ -15,10 +15,9 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from graspd.commands.grasp_sheet import GraspAnimation, GraspSheet, Kind
-from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_result, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, print_result, progress_bar, write_output
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import scene_supports
 from graspd.service.model.transforms import compose
@@ -87,9 +86,7 @@ def render(
         drawn=_best_grasps(scene, hand) if scene.kind == "base" else _hand_in_pictures(scene, with_hand, hand),
         supports=TABLE if spec is None else scene_supports(spec),
     )
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
-        task = bar.add_task("rendering", total=None)
+    with progress_bar(quiet=json) as progress:
         result = render_views(
             obj,
             np.asarray(scene["scene/object_pose"], float),
@@ -100,9 +97,7 @@ def render(
             seed=number,
             baseline_m=baseline,
             extras=extras,
-            run=ExecutionContext(
-                used, progress=lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
-            ),
+            run=ExecutionContext(used, progress=progress),
         )
     seconds = perf_counter() - started
     inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")

@@ -49,8 +49,7 @@ def up(
     from graspd.service.run.supervisor import Supervisor
 
     settings = cli.load_settings(host=host, port=port, device=device, data_dir=data_dir)
-    cli.log_to_stderr(settings, "up")
-    cli.restrict_file_access(settings)
+    cli.set_up_process(settings, "up")
     stop = stop_on_signals()
     console = cli.plain_console(stderr=True)
     others = new_listen_address(settings, share, host=share_host, port=redis_port) if share is not None else None
@@ -75,8 +74,7 @@ def controller(
 ) -> None:
     """Run a controller (retries, index), which leads or stands by. `graspd up` starts one."""
     settings = cli.load_settings(data_dir=data_dir)
-    cli.log_to_stderr(settings, "controller")
-    cli.restrict_file_access(settings)
+    cli.set_up_process(settings, "controller")
     if check:
         from graspd.service.pipeline.leading import PART
         from graspd.service.queue.rq_queue import open_queue
