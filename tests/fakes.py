@@ -111,7 +111,7 @@ def put_asset(services: Services, kind: AssetKind, name: str, files: Mapping[str
     """A hand, an object or a network, and what its check found; its digest."""
     asset = publish_asset(services.store, kind, name, files)
     if check is not None:
-        put_document(services.store, names.asset_check_key(kind, asset.digest), check)
+        put_document(services.store, names.asset_key(kind, asset.digest, "check.json"), check)
     services.index.write.add_asset(asset, check)
     return asset.digest
 

@@ -26,32 +26,9 @@ MARKS: Final = "marks"
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
 
 
-def asset_files_key(kind: AssetKind, digest: str) -> str:
-    return f"{ASSETS}/{kind.value}/{digest}/files.zip"
-
-
-def asset_record_key(kind: AssetKind, digest: str) -> str:
-    return f"{ASSETS}/{kind.value}/{digest}/asset.json"
-
-
-def asset_check_key(kind: AssetKind, digest: str) -> str:
-    return f"{ASSETS}/{kind.value}/{digest}/check.json"
-
-
-def expanded_hand_key(digest: str) -> str:
-    return f"{ASSETS}/{AssetKind.HAND.value}/{digest}/expanded.json"
-
-
-def asset_model_key(kind: AssetKind, digest: str) -> str:
-    return f"{ASSETS}/{kind.value}/{digest}/model.glb"
-
-
-def prepared_object_key(digest: str, key: str) -> str:
-    return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/prepared/{key}.npz"
-
-
-def object_pieces_key(digest: str, key: str) -> str:
-    return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/pieces/{key}.npz"
+def asset_key(kind: AssetKind, digest: str, file: str) -> str:
+    """Return the key of a file of an asset: `asset.json`, its record; `files.zip`, `check.json` or another."""
+    return f"{ASSETS}/{kind.value}/{digest}/{file}"
 
 
 def job_record_key(job: str) -> str:

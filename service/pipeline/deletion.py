@@ -225,7 +225,7 @@ def _record_key(deletion: records.Deletion) -> str:
         return names.job_record_key(deletion.id)
     if deletion.what == "dataset":
         return names.dataset_record_key(deletion.id)
-    return names.asset_record_key(AssetKind(deletion.what), deletion.id)
+    return names.asset_key(AssetKind(deletion.what), deletion.id, "asset.json")
 
 
 def _keys_below(store: Store, folder: str) -> list[str]:
@@ -289,7 +289,7 @@ class GarbageCollector:
         for asset in index.assets.refused(before=timestamp(REFUSED_S)):
             if self._clock() > deadline:
                 return True
-            record = names.asset_record_key(asset.kind, asset.digest)
+            record = names.asset_key(asset.kind, asset.digest, "asset.json")
             with index.database.write_transaction() as connection:
                 if index.removals.reason_to_keep_asset(asset, within=connection):
                     continue

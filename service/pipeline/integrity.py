@@ -356,7 +356,7 @@ def _repair_asset(services: Services, key: str, kind: AssetKind, digest: str, fi
     if is_builtin:
         publish_builtins(services.store)
     if file in ("model.glb", "check.json") and not services.store.exists(key):
-        services.store.set_aside(names.asset_check_key(kind, digest))
+        services.store.set_aside(names.asset_key(kind, digest, "check.json"))
         with contextlib.suppress(NotFoundError, DamagedError):
             services.index.write.add_asset(load_asset(services.store, kind, digest), None)
             services.index.live.set_asset_waiting([digest], queued=False)

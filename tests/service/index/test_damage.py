@@ -86,8 +86,8 @@ RECORDS: dict[str, Callable[[Services], str]] = {
     ),
     "attempt": attempt_of,
     "event": event_of,
-    "asset": lambda services: names.asset_record_key(*ball(services)),
-    "check": lambda services: names.asset_check_key(*ball(services)),
+    "asset": lambda services: names.asset_key(*ball(services), "asset.json"),
+    "check": lambda services: names.asset_key(*ball(services), "check.json"),
     "dataset": lambda services: names.dataset_record_key("kitchen"),
     "snapshot": lambda services: names.dataset_snapshot_key("kitchen", "a" * 32),
 }
