@@ -24,6 +24,7 @@ MARKS: Final = "marks"
 
 #: Kind of the shards of each stage: folder below `shards/` and HDF5 kind.
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
+STAGES: Final = {kind: stage for stage, kind in SHARD_KINDS.items()}
 
 
 def asset_key(kind: AssetKind, digest: str, file: str) -> str:

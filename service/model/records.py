@@ -207,8 +207,7 @@ class SnapshotShard(Record):
     @classmethod
     def _convert_pack_key(cls, key: str, info: ValidationInfo) -> str:
         # A key of graspd 0.2 may refer to a part of a pack; now each shard is a file.
-        stages = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
-        return names.shard_file_key(stages[info.data["kind"]], info.data["id"]) if "@" in key else key
+        return names.shard_file_key(names.STAGES[info.data["kind"]], info.data["id"]) if "@" in key else key
 
 
 class Snapshot(Record):

@@ -131,8 +131,7 @@ def check_service(store: Store, redis: str | None) -> bool:
 
 
 def service_ids(store: Store) -> list[str]:
-    keys = sorted(entry.key for entry in store.list(names.SERVICE))
-    return [read_record(ServiceRecord, store, key).id for key in keys]
+    return [read_record(ServiceRecord, store, key).id for key in store.keys(names.SERVICE)]
 
 
 def recorded_service(folder: Path | None) -> str | None:

@@ -25,7 +25,6 @@ from graspd.service.store.store import Store, open_store
 from graspd.service.user_cache import cache_folder, evict, write_atomically
 
 DEFAULT_BYTES: Final = 20 << 30
-_STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 
 
 @dataclass(frozen=True)
@@ -212,5 +211,5 @@ def _shards_of_snapshot(store: Store, dataset: str, digest: str | None) -> Itera
 
 
 def _sort_files(files: Iterable[ShardFile]) -> tuple[ShardFile, ...]:
-    order = list(_STAGES)
+    order = list(names.STAGES)
     return tuple(sorted(files, key=lambda file: (file.hand, file.object, file.batch, order.index(file.kind), file.id)))
