@@ -77,14 +77,6 @@ class ShardManifest(Record):
     grasps: tuple[GraspSummary, ...] = ()
     info: dict[str, Any] = Field(default_factory=dict)
 
-    @model_validator(mode="before")
-    @classmethod
-    def _set_candidates(cls, data: Any) -> Any:
-        # Shards of early versions contain all candidates.
-        if isinstance(data, dict) and "candidates" not in data and data.get("kind") == "base":
-            return {**data, "candidates": data.get("counts", {}).get("N", 0)}
-        return data
-
     @model_validator(mode="after")
     def _check_summaries(self) -> ShardManifest:
         if self.stage is Stage.SYNTHESIZE and len(self.grasps) != self.counts.get("N"):
