@@ -215,9 +215,7 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
         reason = row["reason"]
         if row["state"] == State.SUCCEEDED.value and options.want == "valid" and found < options.grasps:
             rejected, candidates = outcomes_of(connection, tasks.c.job_id == job), yields.get("candidates", 0)
-            reason = explain_shortfall(
-                found, options.grasps, options.counted_status, candidates, options.budget, rejected
-            )
+            reason = explain_shortfall(options, found, candidates, rejected)
         views.append(
             CellView(
                 **{name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "choice")},
