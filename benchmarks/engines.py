@@ -33,7 +33,6 @@ from graspd.service.model.errors import InputError
 from graspd.studies.engines import (
     compare_frictions,
     held_back_lines,
-    loss_kind,
     matrix_lines,
     plan_candidates,
     summarise_groups,
@@ -81,6 +80,16 @@ are equal. Releases before 3.8 lack a flag that the validator sets.""",
 WIDER: Final = 0.1  # change of friction that shows which verdicts are close to a limit
 DEEP_M: Final = 0.001  # penetration of pregrasps that tells two groups of grasps apart
 CONTROLS: Final = 1  # grasps per file on which engines agree and which variants also validate
+
+
+#: Kinds of losses, by the names of pushes and of lifts.
+LOSSES: Final = {"rotated": "turned", "turned": "turned", "displaced": "dropped", "not lifted": "dropped"}
+
+
+def loss_kind(reason: str) -> str:
+    """Return `turned`, `dropped`, or another reason without the direction of the push."""
+    name = reason.partition(" under ")[0]
+    return LOSSES.get(name, name)
 
 
 def main() -> None:

@@ -23,14 +23,6 @@ from graspd.worker.validation.engines.registry import EngineVerdicts, validate_w
 FRICTIONS: Final = ("full", "half")
 #: Verdicts of several engines per file, by hand, scene and friction.
 Found = dict[tuple[str, ...], list[list[EngineVerdicts]]]
-#: Kinds of losses, by the names of pushes and of lifts.
-_KINDS: Final = {"rotated": "turned", "turned": "turned", "displaced": "dropped", "not lifted": "dropped"}
-
-
-def loss_kind(reason: str) -> str:
-    """Return `turned`, `dropped`, or another reason without the direction of the push."""
-    name = reason.partition(" under ")[0]
-    return _KINDS.get(name, name)
 
 
 def plan_candidates(hand: str, obj: str, scene: str, count: int, seed: int, file: Path, *, threads: int = 0) -> Path:

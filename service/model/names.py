@@ -64,10 +64,6 @@ def dataset_events_folder(dataset: str) -> str:
     return f"{DATASETS}/{dataset}/events"
 
 
-def event_key(events: str, number: int, what: str) -> str:
-    return f"{events}/{number:06}-{what}.json"
-
-
 def dataset_snapshots_folder(dataset: str) -> str:
     return f"{DATASETS}/{dataset}/snapshots"
 
@@ -90,10 +86,6 @@ def tag_versions_folder(tag: str) -> str:
 
 def tag_version_key(tag: str, number: int) -> str:
     return f"{tag_versions_folder(tag)}/{number:06}.json"
-
-
-def service_key(number: int) -> str:
-    return f"{SERVICE}/{number:06}.json"
 
 
 def mark_key(mark: str) -> str:

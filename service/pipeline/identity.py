@@ -150,4 +150,4 @@ def _foreign_index_error(store: str) -> str:
 
 
 def _add_service_record(store: Store, number: int, identity: str) -> None:
-    put_record(store, names.service_key(number), ServiceRecord(id=identity, at=timestamp()))
+    put_record(store, f"{names.SERVICE}/{number:06}.json", ServiceRecord(id=identity, at=timestamp()))

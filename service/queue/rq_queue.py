@@ -221,11 +221,6 @@ class RqQueue:
         if event_ids:
             self.connection.xack(EVENTS, _GROUP, *event_ids)
 
-    def events_after(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Return the events after an id, for any number of readers; `"$"`: only future events, `"0"`: all."""
-        found = self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
-        return [(event_id, event) for event_id, event in entries.parse_events(found) if event is not None]
-
     def announce(self, part: str, seconds: float) -> None:
         """Register a part of the service (the controller) as running for some seconds."""
         self.connection.set(_part_key(part), "1", px=int(seconds * 1000))

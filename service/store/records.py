@@ -71,7 +71,7 @@ def _append_event(make: Callable[..., EventT], store: Store, folder: str, put: P
     while True:
         number = max((int(key.rpartition("/")[2].partition("-")[0]) for key in store.keys(folder)), default=0) + 1
         event = make(number=number, at=timestamp())
-        if (put or partial(put_record, store))(names.event_key(folder, number, event.what), event):
+        if (put or partial(put_record, store))(f"{folder}/{number:06}-{event.what}.json", event):
             return event
 
 

@@ -27,7 +27,7 @@ from graspd.worker.process.runner import Runner
 from graspd.worker.stages.context import StopReason, TaskContext
 from tests.fakes import HAND_FILES, fake_stages, request, with_settings
 from tests.indexes import empty_index
-from tests.memory_queue import Delivery, MemoryQueue
+from tests.memory_queue import Delivery, MemoryQueue, events_after
 from tests.waiting import Clock, until
 
 
@@ -107,7 +107,7 @@ def test_a_job_goes_through_all_its_stages_and_tells_listeners(bench: Bench) -> 
     done = bench.services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 70)
     assert differences(bench.services.index, bench.services.store) == []
-    told = [e for _, e in bench.queue.events_after("0", limit=99, wait_s=0)]
+    told = [e for _, e in events_after(bench.queue)]
     assert [e.message for e in told if e.kind is EventKind.JOB] == ["queued", "running", "succeeded"]
     assert {e.job_id for e in told if e.kind is EventKind.JOB} == {job.id}
 

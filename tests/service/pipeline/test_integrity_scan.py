@@ -83,7 +83,7 @@ def full(services: Services) -> Services:
     gone = Deletion(what="job", id="b" * 32, at=timestamp())
     put_record(store, f"{removed_folder(gone)}/deletion.json", gone)
     put_record(store, f"{removed_folder(gone)}/{names.job_record_key(gone.id)}", record)
-    put_record(store, names.service_key(1), ServiceRecord(id="c" * 32, at=timestamp()))
+    put_record(store, f"{names.SERVICE}/000001.json", ServiceRecord(id="c" * 32, at=timestamp()))
     put_document(store, names.mark_key("d" * 32), {"at": timestamp()})
     hand = services.index.assets.get(AssetKind.HAND, "gripper").digest
     put_document(store, names.asset_key(AssetKind.HAND, hand, "expanded.json"), {"urdf": "<robot name='claw'/>"})
