@@ -90,9 +90,12 @@ def export(
             done = _export_webdataset(source, output, unvalidated=unvalidated, every=every)
         else:
             done = _export_pictures(Path(source), format_, depth, output)
-    told = {"folder": str(output), "format": format_, **done.counts, **({"notes": done.notes} if done.notes else {})}
+    _report({"folder": str(output), "format": format_}, output, done, json=json)
+
+
+def _report(told: dict[str, Any], output: Path, done: ExportSummary, *, json: bool) -> None:
     line = f"{output}: " + ", ".join(f"{n} {what}" for what, n in done.counts.items() if isinstance(n, int))
-    print_result(told, line, json=json)
+    print_result(told | done.counts | ({"notes": done.notes} if done.notes else {}), line, json=json)
     for note in () if json else done.notes:
         typer.echo(note, err=True)
 
@@ -224,10 +227,7 @@ def simready(
     from graspd.exchange.simready import write_simready
 
     done = write_simready(source, grasps, output, best=best)
-    told = {"file": str(output), **done.counts, **({"notes": done.notes} if done.notes else {})}
-    print_result(told, f"{output}: " + ", ".join(f"{n} {what}" for what, n in done.counts.items()), json=json)
-    for note in () if json else done.notes:
-        typer.echo(note, err=True)
+    _report({"file": str(output)}, output, done, json=json)
 
 
 SourceName = Annotated[str, typer.Argument(metavar="NAME", help="Dataset of the store, or folder: ./kitchen-v1.")]

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import getpass
 import os
-import signal
 import socket
-import threading
 from contextlib import closing
 from pathlib import Path
 from time import perf_counter
@@ -22,6 +20,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import scene_supports
 from graspd.service.model.transforms import compose
 from graspd.service.readers.trajectories import scene_spec_of, wrist_angles
+from graspd.service.run.commands import stop_on_signals
 from graspd.service.store import validity
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.engines.devices import Device
@@ -222,9 +221,7 @@ def view(
         raise InputError(said)
     base = read_shard(grasps, kind="base")
     shown = ViewerContent(base, hand_of_shard(base, hand), object_of_shard(base, object), neighbours_of_shard(base, []))
-    ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
+    ended = stop_on_signals()
     with closing(Viewer(shown, host=host, port=port)) as viewer:
         typer.echo(f"{grasps}: {viewer.url}")
         command = forwarding_command(viewer.server.get_port())

@@ -104,10 +104,8 @@ def _format_summary(found: dict[str, Any]) -> str:
     if found.get("payload_kg") is not None:
         lines.append(f"median payload {found['payload_kg']:.2f} kg")
     if second := found.get("second_engines"):
-        line = (
-            f"{second['second_held']} of {second['second_tested']} valid grasps hold in {' and '.join(second['names'])}"
-        )
-        lines.append(line)
+        held = f"{second['second_held']} of {second['second_tested']} valid grasps"
+        lines.append(f"{held} hold in {' and '.join(second['names'])}")
     if found.get("shake_share") is not None:
         lines.append(f"{found['shake_share']:.0%} survive the shake")
     if "scene" in found:

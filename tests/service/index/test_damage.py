@@ -71,7 +71,7 @@ def attempt_of(services: Services) -> str:
 
 def event_of(services: Services) -> str:
     event = add_job_event(services.store, a_job(services), "cancelled")
-    return names.event_key(names.job_events_folder(a_job(services)), event.number, "cancelled")
+    return f"{names.job_events_folder(a_job(services))}/{event.number:06}-cancelled.json"
 
 
 def ball(services: Services) -> tuple[AssetKind, str]:
