@@ -198,9 +198,8 @@ def rebuild_manifest(said: Mapping[str, Any], data: bytes) -> ShardManifest:
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
     shard = read_shard(data, without=pictures, name=said["key"])
     file = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}
-    return ShardManifest.model_validate(
-        {**said, **file, **_content_fields(said["kind"], shard.arrays, shard.attributes)}
-    )
+    content = _content_fields(said["kind"], shard.arrays, shard.attributes)
+    return ShardManifest.model_validate({**said, **file, **content})
 
 
 def _decode_verdict(value: int) -> bool | None:

@@ -52,17 +52,11 @@ class Datasets(IndexPart):
         query = select(datasets).where(datasets.c.name.in_(sorted(names)))
         with self.database.read_transaction() as connection:
             rows = connection.execute(query).mappings().all()
-            return {
-                row["name"] for row in rows if not _dataset_state(row, _cell_counts_by_state(connection, row)).is_final
-            }
+            return {row["name"] for row in rows if not _has_ended(connection, row)}
 
     def ended_event_counts(self, *, within: Connection) -> dict[str, int]:
         rows = self.database.rows(select(datasets), within)
-        return {
-            row["name"]: row["events"]
-            for row in rows
-            if _dataset_state(row, _cell_counts_by_state(within, row)).is_final
-        }
+        return {row["name"]: row["events"] for row in rows if _has_ended(within, row)}
 
     def cells(
         self,
@@ -158,6 +152,10 @@ def _dataset_state(row: Any, states: dict[State, int]) -> State:
         return state if state.is_final else State.CANCELLED
     # After a retry, a dataset counts as queued until its jobs have received that event.
     return State.QUEUED if state.is_final and row["applied"] < row["events"] else state
+
+
+def _has_ended(connection: Connection, row: Any) -> bool:
+    return _dataset_state(row, _cell_counts_by_state(connection, row)).is_final
 
 
 def _cell_counts_by_state(connection: Connection, row: Any) -> dict[State, int]:
