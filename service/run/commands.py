@@ -181,9 +181,8 @@ def export(
 
     with closing(Index(cli.load_settings(data_dir=data_dir).resolved_index_url)) as index:
         rows = write(index.database, output)
-    cli.print_result(
-        rows, "\n".join(f"{output / name}.parquet  {count} rows" for name, count in rows.items()), json=json
-    )
+    lines = [f"{output / name}.parquet  {count} rows" for name, count in rows.items()]
+    cli.print_result(rows, "\n".join(lines), json=json)
 
 
 @index_app.command(epilog="graspd admin index path")
