@@ -28,7 +28,7 @@ STAGES: Final = {kind: stage for stage, kind in SHARD_KINDS.items()}
 
 
 def asset_key(kind: AssetKind, digest: str, file: str) -> str:
-    """Return the key of a file of an asset: `asset.json`, its record; `files.zip`, `check.json` or another."""
+    """Return the key of a file of an asset, as `asset.json` (its record), `files.zip` or `check.json`."""
     return f"{ASSETS}/{kind.value}/{digest}/{file}"
 
 
