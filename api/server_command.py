@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import CommandGroup, load_settings, log_to_stderr, restrict_file_access
+from graspd.service.cli import CommandGroup, load_settings, set_up_process
 from graspd.service.model.libraries import pause_garbage_collection
 
 app = CommandGroup(add_completion=False)
@@ -20,6 +20,5 @@ def api(
         from graspd.api.server import serve
 
     settings = load_settings(host=host, port=port)
-    log_to_stderr(settings, "api")
-    restrict_file_access(settings)
+    set_up_process(settings, "api")
     serve(settings)

@@ -82,6 +82,16 @@ DEEP_M: Final = 0.001  # penetration of pregrasps that tells two groups of grasp
 CONTROLS: Final = 1  # grasps per file on which engines agree and which variants also validate
 
 
+#: Kinds of losses, by the names of pushes and of lifts.
+LOSSES: Final = {"rotated": "turned", "turned": "turned", "displaced": "dropped", "not lifted": "dropped"}
+
+
+def loss_kind(reason: str) -> str:
+    """Return `turned`, `dropped`, or another reason without the direction of the push."""
+    name = reason.partition(" under ")[0]
+    return LOSSES.get(name, name)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)

@@ -6,7 +6,6 @@ from html import escape
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import numpy as np
 import typer
 from rich.console import Console
 
@@ -14,20 +13,20 @@ from graspd.api.formatting import count, duration
 from graspd.api.models import JobDetail
 from graspd.client.client import Client
 from graspd.client.reports import JobDisplay, job_summary, mean_metrics, yield_of
+from graspd.display import sheet_png
+from graspd.grasps import open as open_grasps
 from graspd.service.cli import CommandGroup, JsonFlag, load_settings, plain_console, print_json, write_output
 from graspd.service.command_options import validate_options
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import TaskError
-from graspd.service.model.states import AssetKind, State
+from graspd.service.model.states import State
 from graspd.service.run.supervisor import Supervisor
-from graspd.service.store import validity
-from graspd.service.store.assets import builtin_files
-from graspd.service.store.shards import Shard, read_shard
+from graspd.service.store.shards import read_shard
 
 app = CommandGroup()
 _SHOWN_GRASPS: Final = 12
-#: Rays per pixel of a picture.
-_SAMPLES: Final = 8
+#: Edge of a grasp's picture [px].
+_EDGE: Final = 300
 
 
 @app.command("demo", epilog="graspd demo --out demo-out --grasps 32 --scenes 2 --views 3")
@@ -92,8 +91,8 @@ def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> dict[str, list
     pages: dict[str, bytes] = {}
     bases = [path for path in shards if path.name.startswith("base")]
     views = [path for path in shards if path.name.startswith("views")]
-    if bases:
-        pages["grasps.png"] = draw_grasps(job, read_shard(bases[0], kind="base"))
+    if bases and len(grasps := open_grasps(bases[0])):
+        pages["grasps.png"] = sheet_png(grasps, _SHOWN_GRASPS, _EDGE)
     if views:
         title = f"Views of the {job.object}"
         data = read_shard(views[0], kind="views")
@@ -104,28 +103,6 @@ def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> dict[str, list
     for name, content in pages.items():
         write_output(out / name, content)
     return {"shards": [*map(str, shards)], "pictures": [*map(str, pictures)], "page": str(out / "index.html")}
-
-
-def draw_grasps(job: JobDetail, base: Shard) -> bytes:
-    """Return a PNG of the best grasps of a shard, ranked by ε."""
-    # Warp is imported late, because its import takes seconds.
-    from graspd.worker.engines import backend
-    from graspd.worker.hands.load import load_hand
-    from graspd.worker.objects.prepare import load_object
-    from graspd.worker.rendering.pictures import grasp_pictures
-    from graspd.worker.rendering.sheets import best_rows, caption_entries, contact_sheet
-
-    backend.start_warp()
-    hand = load_hand(builtin_files(AssetKind.HAND, job.hand), name=job.hand, digest=job.hand_digest)
-    files, error_m = builtin_files(AssetKind.OBJECT, job.object), job.request.resolved_fidelity.face_error_m
-    obj = load_object(files, name=job.object, digest=job.object_digest, face_error_m=error_m)
-    rows = best_rows(base.arrays, _SHOWN_GRASPS, validity.valid_mask(base.arrays))
-    poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
-    pictures = grasp_pictures(hand, obj, poses, joints, samples=_SAMPLES)[:, 0]
-    # The font of the sheet has neither Greek letters nor a multiplication sign.
-    title = f"{job.hand} on {job.object}"
-    subtitle = f"the best {len(rows)} of {job.grasps} valid grasps by epsilon, of {job.candidates} candidates"
-    return contact_sheet(pictures, caption_entries(base.arrays, rows), title=title, subtitle=subtitle)
 
 
 def html_page(job: JobDetail, pictures: list[Path], shards: list[Path], out: Path) -> str:

@@ -21,6 +21,8 @@ from graspd.service.run.doctor.checks import THREADS, Check, Condition, Finding,
 from graspd.service.settings import Settings
 
 app = CommandGroup(no_args_is_help=False)
+#: Time limit of a full comparison, which reads every record of the store [s].
+_FULL_S: Final = 24 * 3600.0
 _COLOURS: Final = {"good": "green", "warning": "yellow", "bad": "red", "skipped": "bright_black"}
 
 
@@ -63,8 +65,27 @@ def _exit(code: int) -> None:
 
 
 def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
-    """Return the checks of all packages; a check of a missing package reports that it is not installed."""
-    checks = checks_of(settings, full=full)
+    """Return the checks of all packages; a check of a missing package reports that it is not installed.
+
+    With `full`, all rows of the index are compared with the store.
+    """
+    full_s = _FULL_S if full else 120.0
+    checks = [
+        Check("disk", partial(machine.check_disk, settings)),
+        Check("data-folder", partial(machine.check_data_folder, settings)),
+        Check("limits", machine.check_limits),
+        Check("redis", partial(backends.check_redis, settings)),
+        Check("redis-persistence", partial(backends.check_persistence, settings)),
+        Check("store", partial(backends.check_configured_store, settings), limit_s=120.0),
+        Check("index", partial(backends.check_index, settings)),
+        Check("identity", partial(backends.check_index_identity, settings)),
+        Check("index-is-store", partial(backends.compare_index_with_store, settings, full=full), limit_s=full_s),
+        Check("damage", partial(backends.check_store_damage, settings)),
+        Check("clocks", partial(fleet.check_clocks, settings), limit_s=120.0),
+        Check("controller", partial(fleet.check_controller, settings)),
+        Check("workers", partial(fleet.check_workers, settings)),
+        Check("port", partial(fleet.check_port, settings)),
+    ]
     if missing_extra("graspd.api"):
         checks.append(_skipped_check("keys", "api"))
     else:
@@ -73,9 +94,9 @@ def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
         checks.append(Check("keys", partial(check_keys, settings)))
     if missing_extra("graspd.commands"):
         return [*checks, _skipped_check("gpu", "worker"), _skipped_check("kernels", "worker")]
-    from graspd.commands.doctor import checks_of as of_worker
+    from graspd.commands.doctor import checks_of
 
-    return checks + of_worker(settings)
+    return checks + checks_of(settings)
 
 
 def _skipped_check(name: str, extra: str) -> Check:
@@ -97,28 +118,3 @@ def _show(finding: Finding) -> None:
     typer.echo(f"{mark} {finding.name:17} {finding.message}")
     if finding.fix:
         typer.echo(f"{'':26} fix: {finding.fix}")
-
-
-#: Time limit of a full comparison, which reads every record of the store [s].
-_FULL_S: Final = 24 * 3600.0
-
-
-def checks_of(settings: Settings, *, full: bool = False) -> list[Check]:
-    """Return the checks without engine and API; with `full`, all index rows are compared with the store."""
-    full_s = _FULL_S if full else 120.0
-    return [
-        Check("disk", partial(machine.check_disk, settings)),
-        Check("data-folder", partial(machine.check_data_folder, settings)),
-        Check("limits", machine.check_limits),
-        Check("redis", partial(backends.check_redis, settings)),
-        Check("redis-persistence", partial(backends.check_persistence, settings)),
-        Check("store", partial(backends.check_configured_store, settings), limit_s=120.0),
-        Check("index", partial(backends.check_index, settings)),
-        Check("identity", partial(backends.check_index_identity, settings)),
-        Check("index-is-store", partial(backends.compare_index_with_store, settings, full=full), limit_s=full_s),
-        Check("damage", partial(backends.check_store_damage, settings)),
-        Check("clocks", partial(fleet.check_clocks, settings), limit_s=120.0),
-        Check("controller", partial(fleet.check_controller, settings)),
-        Check("workers", partial(fleet.check_workers, settings)),
-        Check("port", partial(fleet.check_port, settings)),
-    ]

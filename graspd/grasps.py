@@ -364,9 +364,8 @@ def open(
         DamagedError: a file does not match its checksum.
     """
     shards = open_shards(source, job=job, dataset=dataset)
-    return concatenate(
-        [read_shard(shards.path(file), kind="base") for file in _select_hand(shards, hand).of_kind("base")]
-    )
+    found = _select_hand(shards, hand).of_kind("base")
+    return concatenate([read_shard(shards.path(file), kind="base") for file in found])
 
 
 def concatenate(shards: Sequence[Shard]) -> Grasps:

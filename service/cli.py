@@ -11,16 +11,16 @@ import os
 import signal
 import stat
 import sys
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, ParamSpec, TextIO, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, ParamSpec, TextIO, TypeVar
 
 import typer
 from pydantic import BaseModel, ValidationError
 
 from graspd.service.model.base import first_error
 from graspd.service.model.errors import GraspdError, InputError, without_secrets
+from graspd.service.telemetry import set_up_logs
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -108,14 +108,17 @@ def _discard_output(stream: TextIO | None) -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def write_output(path: Path, content: bytes) -> None:
+def write_output(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write an output file atomically; a device, a pipe or the target of a link is written directly."""
+    pieces = [content] if isinstance(content, bytes) else content
     if path.is_symlink() or (path.exists() and not path.is_file()):
-        path.write_bytes(content)
+        with path.open("wb") as file:
+            file.writelines(pieces)
         return
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        part.write_bytes(content)
+        with part.open("wb") as file:
+            file.writelines(pieces)
         if path.exists():
             part.chmod(path.stat().st_mode)
         part.replace(path)
@@ -160,6 +163,21 @@ def plain_console(*, stderr: bool = False) -> Console:
     return Console(stderr=stderr, markup=False, emoji=False, highlight=False)
 
 
+@contextlib.contextmanager
+def progress_bar(*, quiet: bool) -> Iterator[Callable[[float, float, str], None]]:
+    """Show a bar on a terminal, unless `quiet`; yield a function of finished work, all work and a message."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda done, total, message: None
+        return
+    from rich import progress as rich
+
+    parts = (rich.BarColumn(), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TimeRemainingColumn())
+    text = rich.TextColumn("{task.description}", markup=False)
+    with rich.Progress(text, *parts, console=plain_console(stderr=True), transient=True) as bar:
+        task = bar.add_task("starting", total=None)
+        yield lambda done, total, message: bar.update(task, completed=done, total=total, description=message)
+
+
 def plain_table(*headings: str, whole: Collection[str] = ()) -> Table:
     from rich.table import Table
 
@@ -194,28 +212,9 @@ def load_settings(**overrides: Any) -> Settings:
         raise InputError(f"GRASPD_{place[0]}".upper() + text.removeprefix(str(place[0])) if place else text) from None
 
 
-@dataclass(frozen=True)
-class EngineSettings:
-    prefilter: Literal["auto", "on", "off"] = "auto"
-    processes: int = 0
-
-
-def engine_settings() -> EngineSettings:
-    """Load engine settings from the environment; import the settings module only if a variable is set."""
-    if not any(name.upper().startswith("GRASPD_") for name in os.environ):
-        return EngineSettings()
-    found = load_settings()
-    return EngineSettings(found.prefilter, found.processes)
-
-
-def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
-    from graspd.service import telemetry
-
-    telemetry.set_up_logs(settings, process)
-
-
-def restrict_file_access(settings: Settings) -> None:
-    """Make the data folder and all new files of this process and its children private to the user."""
+def set_up_process(settings: Settings, process: str) -> None:
+    """Log to stderr under a process name; make the data folder and all new files private to the user."""
+    set_up_logs(settings, process)
     os.umask(0o077)
     with contextlib.suppress(OSError):
         status = settings.data_dir.stat()

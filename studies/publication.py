@@ -46,8 +46,8 @@ DATA: Final = (*_TABLES, "webdataset")
 _STATED: Final = ("licence", "source", "digest")
 _KINDS: Final = ("hands", "objects")
 _REPOSITORY: Final = re.compile(r"[\w.-]+/[\w.-]+")
-#: Called with the current step, and the numbers of its finished parts and of all its parts.
-Progress = Callable[[str, int, int], None]
+#: Called with the numbers of finished and of all parts of the current step, and the step.
+Progress = Callable[[float, float, str], None]
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def publish(contents: Contents, folder: Path, options: PublicationOptions, progr
             "unknown": unknown,
         }
         said: dict[str, Any] = {"licence": options.licence, "source": options.source, "publication": publication}
-        card = write_card(contents, draft, progress=lambda done, total: progress("card", done, total), **said)
+        card = write_card(contents, draft, progress=lambda done, total: progress(done, total, "card"), **said)
         assets = {
             kind: {one["name"]: {key: one[key] for key in _STATED} for one in card["composition"][kind]}
             for kind in _KINDS
@@ -156,7 +156,7 @@ def _write_data(
         base = [file for file in mine if file.kind == "base"]
         starts = range(0, len(base), SHARDS_A_FILE)
         for number, first in enumerate(starts):
-            progress(f"grasps of {split}", number, len(starts))
+            progress(number, len(starts), f"grasps of {split}")
             rows = _grasp_rows(contents, base[first : first + SHARDS_A_FILE], every=options.every)
             _write_table(draft / "grasps" / f"{split}-{number:05}.parquet", huggingface.GRASPS, rows)
         shards = replace(contents.shards, files=mine)
@@ -165,14 +165,14 @@ def _write_data(
         names = {file.id: plain_name(file.object) for file in base}
         seen = Pictures(shards, (*COLUMNS, "image/rgb"), grasp_quality=(), valid=not options.every)
         for number, some in enumerate(parts := _parts(seen)):
-            progress(f"pictures of {split}", number, len(parts))
+            progress(number, len(parts), f"pictures of {split}")
             rows = huggingface.picture_rows(seen, some, names)
             _write_table(draft / "pictures" / f"{split}-{number:05}.parquet", huggingface.PICTURES, rows)
         if options.webdataset:
             # Hugging Face's reader infers types from the first samples, and fails if their lists of grasps are empty.
             samples = webdataset.open_pictures(shards, valid=not options.every, with_grasps_only=True)
             for number, some in enumerate(parts := _parts(samples)):
-                progress(f"tar files of {split}", number, len(parts))
+                progress(number, len(parts), f"tar files of {split}")
                 tar = draft / "webdataset" / f"{split}-{number:06}.tar"
                 _write_whole(tar, partial(webdataset.write_tar, samples, some))
 

@@ -111,7 +111,7 @@ def put_asset(services: Services, kind: AssetKind, name: str, files: Mapping[str
     """A hand, an object or a network, and what its check found; its digest."""
     asset = publish_asset(services.store, kind, name, files)
     if check is not None:
-        put_document(services.store, names.asset_check_key(kind, asset.digest), check)
+        put_document(services.store, names.asset_key(kind, asset.digest, "check.json"), check)
     services.index.write.add_asset(asset, check)
     return asset.digest
 
@@ -227,8 +227,8 @@ def main() -> None:
     the worker that puts the first shard is killed before it tells; a file of that name says so. Of the options of
     `graspd worker` it takes `--burst` and `--idle`.
     """
-    from graspd.service.cli import log_to_stderr
     from graspd.service.settings import Settings
+    from graspd.service.telemetry import set_up_logs
     from graspd.worker.process import engine
     from graspd.worker.process.main import run_worker
 
@@ -254,7 +254,7 @@ def main() -> None:
     if "--engine" in sys.argv:
         engine.main(table, check)
     settings = Settings()
-    log_to_stderr(settings, "worker")
+    set_up_logs(settings, "worker")
     options = argparse.ArgumentParser()
     options.add_argument("--burst", action="store_true")
     options.add_argument("--idle", type=int, default=0)

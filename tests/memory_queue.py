@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 
 from graspd.service.model.messages import WorkerHeartbeat
 from graspd.service.model.states import Priority, Stage
+from graspd.service.queue.entries import parse_events
 from graspd.service.queue.port import Event, Lease, Message, QueueStatus, priority_order
-from graspd.service.queue.rq_queue import RqQueue
+from graspd.service.queue.rq_queue import EVENTS, RqQueue
 
 
 @dataclass
@@ -106,12 +107,6 @@ class MemoryQueue(RqQueue):
         left = (i for i in range(len(self._stream)) if str(i + 1) not in self._acknowledged)
         self._read = next(left, len(self._stream))
 
-    def events_after(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        with self._changed:
-            start = len(self._stream) if after == "$" else int(after)
-            self._changed.wait_for(lambda: len(self._stream) > start, timeout=wait_s)
-            return [(str(i + 1), e) for i, e in enumerate(self._stream) if i >= start][:limit]
-
     def announce(self, part: str, seconds: float) -> None:
         self._announced[part] = self.clock() + seconds
 
@@ -173,3 +168,11 @@ class MemoryQueue(RqQueue):
 
     def finish(self, delivery: Delivery) -> None:
         self._held.pop(delivery.key, None)
+
+
+def events_after(queue: RqQueue | MemoryQueue, after: str = "0") -> list[tuple[str, Event]]:
+    """Return the events of this or the other queue after an id, by default all."""
+    if isinstance(queue, MemoryQueue):
+        return [(str(i + 1), event) for i, event in enumerate(queue._stream) if i >= int(after)]
+    found = parse_events(queue.connection.xread({EVENTS: after}))
+    return [(event_id, event) for event_id, event in found if event is not None]

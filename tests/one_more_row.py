@@ -20,12 +20,12 @@ METRIC = metrics.GraspMetric(
 )
 OPTION, FLAG = "finger_force", "--finger-force"
 ROW = f"""
-    {OPTION}: Annotated[
-        float, Option(), FormField("Grasp", "Finger force", "of each finger", cells=True)
-    ] = _sparse_field(5.0, ge=1, le=20, description="{MEANING} [N]")
+    {OPTION}: Annotated[float, Option()] = _sparse_field(5.0, "{MEANING} [N]", ge=1, le=20)
 """
-#: The row stands before the first rule of the table.
+FORM_ROW = f'    "{OPTION}": FormField("Grasp", "Finger force", "of each finger", cells=True),\n'
+#: The rows stand before the first rule of the options, and first in the table of the form.
 _BEFORE = '\n    @field_validator("fidelity")'
+_FORM = "FORM: Final[dict[str, FormField]] = {\n"
 
 
 def add_rows() -> None:
@@ -34,9 +34,10 @@ def add_rows() -> None:
     spec = find_spec("graspd.service.model.domain")
     assert spec is not None and spec.origin is not None
     source = Path(spec.origin).read_text()
-    assert source.count(_BEFORE) == 1
+    assert source.count(_BEFORE) == source.count(_FORM) == 1
     module = sys.modules[spec.name] = module_from_spec(spec)
-    exec(compile(source.replace(_BEFORE, ROW + _BEFORE), spec.origin, "exec"), module.__dict__)
+    source = source.replace(_BEFORE, ROW + _BEFORE).replace(_FORM, _FORM + FORM_ROW)
+    exec(compile(source, spec.origin, "exec"), module.__dict__)
 
 
 def of_option(folder: Path) -> dict[str, Any]:

@@ -19,11 +19,12 @@ from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
-from typing import Final, Self
+from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
+from graspd.service.model.options import Option
 from graspd.service.model.projects import PATTERN, Project
 
 PREFIX: Final = "gd_"
@@ -42,21 +43,25 @@ class Scope(StrEnum):
         return order.index(self) >= order.index(other)
 
 
+#: Limit of a key or project, with its option on the command line.
+Limit = Annotated[int | None, Option(places=("limit",))]
+
+
 class KeyLimits(BaseModel):
     """Limits of one key. None means the limit of the settings, 0 means no limit."""
 
-    requests_per_minute: int | None = Field(None, ge=0)
-    concurrency: int | None = Field(None, ge=0, description="concurrent requests")
-    grasps_in_flight: int | None = Field(None, ge=0, description="maximum grasps in unfinished jobs")
-    jobs_per_day: int | None = Field(None, ge=0, description="new jobs per day (UTC)")
+    requests_per_minute: Limit = Field(None, ge=0, description="requests per minute; 0: no limit")
+    concurrency: Limit = Field(None, ge=0, description="concurrent requests; 0: no limit")
+    grasps_in_flight: Limit = Field(None, ge=0, description="grasps in unfinished jobs; 0: no limit")
+    jobs_per_day: Limit = Field(None, ge=0, description="new jobs per day (UTC); 0: no limit")
 
 
 class ProjectLimits(BaseModel):
     """Shared limits of the keys of one project. None and 0 mean no limit."""
 
-    grasps_in_flight: int | None = Field(None, ge=0, description="maximum grasps in unfinished jobs")
-    grasps_per_day: int | None = Field(None, ge=0, description="requested grasps per day (UTC)")
-    gpu_seconds_per_day: int | None = Field(None, ge=0, description="GPU time of tasks per day (UTC) [s]")
+    grasps_in_flight: Limit = Field(None, ge=0, description="grasps in unfinished jobs; 0: no limit")
+    grasps_per_day: Limit = Field(None, ge=0, description="requested grasps per day (UTC); 0: no limit")
+    gpu_seconds_per_day: Limit = Field(None, ge=0, description="GPU time of tasks per day (UTC) [s]; 0: no limit")
 
 
 class Key(BaseModel):

@@ -58,7 +58,7 @@ class Assets:
 
     def model(self, asset: AssetView) -> bytes:
         """Return the prepared hand or object as binary glTF; raise NotFoundError before its check."""
-        return get_sealed(self._services.store, names.asset_model_key(asset.kind, asset.digest))
+        return get_sealed(self._services.store, names.asset_key(asset.kind, asset.digest, "model.glb"))
 
     def add(
         self,
@@ -91,7 +91,7 @@ class Assets:
         asset = library.store_files(store, kind, name, files, said=said)
         if found is not None:
             # The check is stored first, because jobs can use the network once it is recorded.
-            put_document(store, names.asset_check_key(kind, asset.digest), found)
+            put_document(store, names.asset_key(kind, asset.digest, "check.json"), found)
         # With two simultaneous uploads under one name, the later one must find the record of the earlier one.
         with record_transaction(self._services) as (connection, put):
             self._check_name(kind, name, asset.digest)
@@ -107,7 +107,7 @@ class Assets:
         """Create a hand from the same files with corrected facts; by default its name gets a number."""
         hand = self.get(AssetKind.HAND, name)
         facts = self.hand_facts(hand)
-        archive = self._services.store.get(names.asset_files_key(AssetKind.HAND, hand.digest))
+        archive = self._services.store.get(names.asset_key(AssetKind.HAND, hand.digest, "files.zip"))
         files = ZipFiles(io.BytesIO(archive), limit_bytes=library.UNPACKED_LIMIT_BYTES)
         if digest_files(AssetKind.HAND, files) != hand.digest:
             raise DamagedError(f"the files of the hand {hand.name!r} in the store are damaged; upload it again")

@@ -27,7 +27,7 @@ from graspd.service.index.index import Index
 from graspd.service.index.queries.overview import BatchCost
 from graspd.service.model.base import first_error, problem_text
 from graspd.service.model.clock import timestamp
-from graspd.service.model.domain import JobOptions, JobRequest
+from graspd.service.model.domain import FORM, JobOptions, JobRequest
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.options import FormField, OptionRow, option_rows
 from graspd.service.model.states import AssetKind, Stage
@@ -82,7 +82,7 @@ class FormInput:
 
 def inputs_of(*, cells: bool = False) -> list[FormInput]:
     """Return the fields of a job's form, or of a dataset's with `cells`."""
-    rows = [(row, row.form) for row in option_rows(JobOptions, "job")]
+    rows = [(row, FORM.get(row.name)) for row in option_rows(JobOptions, "job")]
     return [FormInput.from_row(row, form) for row, form in rows if form and (form.cells or not cells)]
 
 

@@ -11,8 +11,9 @@ from typing import Final
 
 import numpy as np
 
+from benchmarks.integrators.grades import grade
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
-from graspd.service.model.studies import MapCell, StabilityMap, format_short, grade, mark_reachable
+from graspd.service.model.studies import MapCell, StabilityMap, format_short, mark_reachable
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel

@@ -14,8 +14,9 @@ from typing import Final
 import numpy as np
 
 from benchmarks.integrators import reference
+from benchmarks.integrators.grades import grade
 from benchmarks.integrators.reference import Contacts, World
-from graspd.service.model.studies import MapCell, StabilityMap, format_short, grade, mark_reachable
+from graspd.service.model.studies import MapCell, StabilityMap, format_short, mark_reachable
 from graspd.service.model.transforms import Floats
 from graspd.worker.simulation.model import LossOptions
 

@@ -13,8 +13,9 @@ import warp as wp
 
 from benchmarks.integrators import reference
 from benchmarks.integrators.flights import Solver, gauss_seidel_sweep
+from benchmarks.integrators.grades import grade
 from benchmarks.integrators.reference import Contacts, World
-from graspd.service.model.studies import MapCell, StabilityMap, grade, mark_reachable
+from graspd.service.model.studies import MapCell, StabilityMap, mark_reachable
 from graspd.service.model.transforms import Floats
 from graspd.worker.simulation.kernels import contact, kinematics, packing
 from graspd.worker.simulation.model import initial_motions

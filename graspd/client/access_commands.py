@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from datetime import timedelta
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -13,6 +13,7 @@ from graspd.api.formatting import minute
 from graspd.client.client import request_path
 from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, report_deletion
 from graspd.service.cli import CommandGroup, JsonFlag, load_settings, print_result
+from graspd.service.command_options import with_options
 from graspd.service.model.errors import InputError
 
 keys_app = CommandGroup(no_args_is_help=True, help="Make, list, rotate, limit and revoke API keys.")
@@ -22,33 +23,22 @@ _UNITS: Final = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days"}
 NameArgument = Annotated[str, typer.Argument(help="Name of the key.")]
 ProjectOption = Annotated[str, typer.Option(help="Project of the key; its resources are private.", metavar="NAME")]
 LifetimeOption = Annotated[str | None, typer.Option("--expires", help="Lifetime: 90d or 12h; default: unlimited.")]
-RequestsOption = Annotated[int | None, typer.Option(min=0, help="Requests per minute; 0: no limit.")]
-ConcurrencyOption = Annotated[int | None, typer.Option(min=0, help="Concurrent requests; 0: no limit.")]
-GraspsOption = Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")]
-JobsOption = Annotated[int | None, typer.Option(min=0, help="New jobs per day (UTC); 0: no limit.")]
 
 
 @keys_app.command("add", epilog="graspd keys add alice --scope submit --expires 90d --grasps-in-flight 100000")
+@with_options(KeyLimits, "limit")
 def add_key(
     name: NameArgument,
     scope: Annotated[Scope, typer.Option(help="Scope of the key.")] = Scope.SUBMIT,
     project: ProjectOption = "",
     expires: LifetimeOption = None,
-    requests_per_minute: RequestsOption = None,
-    concurrency: ConcurrencyOption = None,
-    grasps_in_flight: GraspsOption = None,
-    jobs_per_day: JobsOption = None,
+    *,
+    options: dict[str, Any],
     json: JsonFlag = False,
 ) -> None:
     """Make a key and show it once. Default limits are those of the settings."""
-    limits = KeyLimits(
-        requests_per_minute=requests_per_minute,
-        concurrency=concurrency,
-        grasps_in_flight=grasps_in_flight,
-        jobs_per_day=jobs_per_day,
-    )
     lifetime = parse_duration(expires) if expires else None
-    token = _key_file().add(name, scope, lifetime=lifetime, limits=limits, project=project)
+    token = _key_file().add(name, scope, lifetime=lifetime, limits=KeyLimits(**options), project=project)
     _show_token(name, scope, token, json=json)
 
 
@@ -66,24 +56,12 @@ def rotate_key(
 
 
 @keys_app.command("limit", epilog="graspd keys limit alice --requests-per-minute 60 --jobs-per-day 100")
-def limit_key(
-    name: NameArgument,
-    requests_per_minute: RequestsOption = None,
-    concurrency: ConcurrencyOption = None,
-    grasps_in_flight: GraspsOption = None,
-    jobs_per_day: JobsOption = None,
-    json: JsonFlag = False,
-) -> None:
+@with_options(KeyLimits, "limit")
+def limit_key(name: NameArgument, *, options: dict[str, Any], json: JsonFlag = False) -> None:
     """Change the limits of a key, from the next request on."""
-    given = _given_limits(
-        requests_per_minute=requests_per_minute,
-        concurrency=concurrency,
-        grasps_in_flight=grasps_in_flight,
-        jobs_per_day=jobs_per_day,
-    )
-    if not given:
+    if not options:
         raise InputError("give at least one limit, such as --jobs-per-day 100")
-    limits = _key_file().set_limits(name, KeyLimits(**given))
+    limits = _key_file().set_limits(name, KeyLimits(**options))
     document = {"name": name, "limits": limits.model_dump(exclude_none=True)}
     print_result(document, f"limits of {name}: {_key_limits(limits)}", json=json)
 
@@ -118,10 +96,6 @@ def parse_duration(text: str) -> timedelta:
     if match is None:
         raise InputError(f"{text!r} is not a duration; write 90d, 12h, 30m or 45s")
     return timedelta(**{_UNITS[match[2]]: int(match[1])})
-
-
-def _given_limits(**limits: int | None) -> dict[str, int]:
-    return {name: value for name, value in limits.items() if value is not None}
 
 
 def _show_token(name: str, scope: Scope, token: str, *, json: bool) -> None:
@@ -161,19 +135,17 @@ def list_projects(json: JsonFlag = False) -> None:
 
 
 @projects_app.command("limit", epilog="graspd projects limit vision --gpu-seconds-per-day 86400")
+@with_options(ProjectLimits, "limit")
 def limit_project(
     name: Annotated[str, typer.Argument(help="Name of the project.")],
-    grasps_in_flight: Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")] = None,
-    grasps_per_day: Annotated[int | None, typer.Option(min=0, help="Requested grasps per day; 0: no limit.")] = None,
-    gpu_seconds_per_day: Annotated[int | None, typer.Option(min=0, help="GPU time per day [s]; 0: no limit.")] = None,
+    *,
+    options: dict[str, Any],
     json: JsonFlag = False,
 ) -> None:
     """Change the shared limits of a project's keys, from the next submission on."""
-    per_day = {"grasps_per_day": grasps_per_day, "gpu_seconds_per_day": gpu_seconds_per_day}
-    given = _given_limits(grasps_in_flight=grasps_in_flight, **per_day)
-    if not given:
+    if not options:
         raise InputError("give at least one limit, such as --grasps-per-day 1000000")
-    limits = _key_file().limit_project(name, ProjectLimits(**given))
+    limits = _key_file().limit_project(name, ProjectLimits(**options))
     document = {"project": name, "limits": limits.model_dump(exclude_none=True)}
     print_result(document, f"limits of {name}: {_project_limits(limits)}", json=json)
 

@@ -16,6 +16,7 @@ from pydantic import BaseModel, TypeAdapter
 
 from graspd.api.formatting import is_loopback
 from graspd.api.models import Job, JobDetail
+from graspd.service.cli import write_output
 from graspd.service.index.views import AssetView, CellView, DatasetView, ObjectSetView, Page, SnapshotView
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError, without_secrets
@@ -132,14 +133,7 @@ class Client(AbstractContextManager["Client"]):
         self, address: str, path: Path, *, params: dict[str, str] | None = None, patience_s: float = _PATIENCE_S
     ) -> Path:
         """Download a file from the API; `path` appears once it is complete. `patience_s`: see `fetch`."""
-        draft = path.with_name(f".{path.name}.part")
-        try:
-            with draft.open("wb") as file:
-                for chunk in self.fetch(address, params=params, patience_s=patience_s):
-                    file.write(chunk)
-            draft.replace(path)
-        finally:
-            draft.unlink(missing_ok=True)
+        write_output(path, self.fetch(address, params=params, patience_s=patience_s))
         return path
 
     def watch(self, job_id: str) -> Iterator[Job]:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Self
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from graspd.api.formatting import count, duration, metric, percent, size, valid_yield, worker_time
@@ -182,14 +182,6 @@ def _print_job(job: JobDetail, url: str) -> None:
 _LINE_EVERY_S: Final = 2.0
 
 
-class _Rate(ProgressColumn):
-    def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        if not speed:
-            return Text("", style="dim")
-        return Text(f"{metric(speed * task.fields['scale'])} {task.fields['unit']}/s", style="cyan")
-
-
 class JobDisplay:
     """Context manager that shows a job's progress: bars on a terminal, elsewhere lines."""
 
@@ -199,7 +191,7 @@ class JobDisplay:
             TextColumn("{task.description:<11}"),
             BarColumn(bar_width=32),
             TextColumn("{task.percentage:>3.0f} %"),
-            _Rate(),
+            TextColumn("{task.fields[rate]}", style="cyan"),
             TimeRemainingColumn(compact=True, elapsed_when_finished=True),
             TextColumn("{task.fields[message]}", style="dim", markup=False),
             console=console,
@@ -218,53 +210,47 @@ class JobDisplay:
 
     def update(self, job: Job) -> None:
         for stage in job.stages:
+            now = time.monotonic()
             if stage.state is not State.QUEUED:
-                self._started.setdefault(stage.stage, time.monotonic())
+                self._started.setdefault(stage.stage, now)
+            seconds = now - self._started.get(stage.stage, now)
+            rate = _rate_text(stage, job, seconds)
             if self._console.is_terminal:
-                self._update_bar(stage, job)
+                self._update_bar(stage, rate)
             else:
-                self._print_state(stage, job)
+                self._print_state(stage, rate, seconds, now)
 
-    def _update_bar(self, stage: StageStatus, job: Job) -> None:
+    def _update_bar(self, stage: StageStatus, rate: str) -> None:
         if stage.stage not in self._bars:
-            made, unit = _stage_items(stage, job)
             self._bars[stage.stage] = self._progress.add_task(
-                stage.stage.value,
-                total=stage.tasks,
-                start=False,
-                message="",
-                scale=made / max(1, stage.tasks),
-                unit=unit,
+                stage.stage.value, total=stage.tasks, start=False, message="", rate=rate
             )
         bar = self._bars[stage.stage]
         if stage.state is not State.QUEUED and not self._progress.tasks[bar].started:
             self._progress.start_task(bar)
         message = stage.message if stage.state is State.RUNNING else stage.state.value
-        self._progress.update(bar, completed=stage.done, message=message)
+        self._progress.update(bar, completed=stage.done, message=message, rate=rate)
 
-    def _print_state(self, stage: StageStatus, job: Job) -> None:
-        now = time.monotonic()
+    def _print_state(self, stage: StageStatus, rate: str, seconds: float, now: float) -> None:
         at, state = self._said.get(stage.stage, (0.0, State.QUEUED))
         if stage.state is state and (state is not State.RUNNING or now - at < _LINE_EVERY_S):
             return
         self._said[stage.stage] = (now, stage.state)
-        self._console.print(self._line(stage, job, now))
-
-    def _line(self, stage: StageStatus, job: Job, now: float) -> str:
-        elapsed, (made, unit) = now - self._started.get(stage.stage, now), _stage_items(stage, job)
         words = f"{stage.stage.value:<11} {stage.state.value:<10} {100 * stage.progress:3.0f} %"
-        if stage.state is State.SUCCEEDED:
-            seconds = stage.seconds or elapsed
-            return f"{words}  {metric(made / seconds)} {unit}/s  in {duration(seconds)}" if seconds else words
-        if stage.state is State.RUNNING and elapsed > 1 and 0 < stage.progress < 1:
-            pace = stage.progress / elapsed
-            return f"{words}  {metric(made * pace)} {unit}/s  {duration((1 - stage.progress) / pace)} left"
-        return words
+        if rate and stage.state is State.SUCCEEDED:
+            words += f"  {rate}  in {duration(stage.seconds or seconds)}"
+        elif rate:
+            words += f"  {rate}  {duration(seconds / stage.progress - seconds)} left"
+        self._console.print(words)
 
 
-def _stage_items(stage: StageStatus, job: Job) -> tuple[int, str]:
-    """Return the number of items that a stage makes, and their name."""
-    return (job.requested, "grasps") if stage.stage is Stage.SYNTHESIZE else (stage.tasks, "tasks")
+def _rate_text(stage: StageStatus, job: Job, seconds: float) -> str:
+    """Return the pace of a stage after its end, or `seconds` after its start; "" in the first second."""
+    share = stage.progress if stage.state is State.RUNNING and seconds > 1 else 0.0
+    if stage.state is State.SUCCEEDED:
+        share, seconds = 1.0, stage.seconds or seconds
+    made, unit = (job.requested, "grasps") if stage.stage is Stage.SYNTHESIZE else (stage.tasks, "tasks")
+    return f"{metric(made * share / seconds)} {unit}/s" if share and seconds else ""
 
 
 #: Maximum number of hands in a table; with more hands, each cell has a line.

@@ -9,17 +9,16 @@ from typing import Annotated, Any, Final
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from graspd.exchange.inputs import expand_path, load_case
-from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json, progress_bar, write_output
 from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
 from graspd.service.store.shards import inherited_attributes, json_attribute, read_shard, write_shard
 from graspd.studies.engines import compare_engines, matrix_lines, summarise
 from graspd.studies.evaluation import checked_level, combine_rows, evaluate
-from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.execution_context import ExecutionContext, Progress
 from graspd.worker.files.subsets import require_empty_folder
 from graspd.worker.validation.engines.registry import EngineVerdicts, check_engines, engine_columns
 from graspd.worker.validation.robust import Robustness
@@ -65,16 +64,13 @@ def evaluate_command(
     copies = _copy_paths(files, listed, out, columns=bool(robust or several), hard=hard)
     rows: list[dict[str, Any]] = []
     verdicts: dict[str, list[EngineVerdicts]] = {}
-    name, done = TextColumn("{task.description}", markup=False), TextColumn("{task.completed:.0f}/{task.total:.0f}")
-    columns = (name, BarColumn(), done, TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
-        task = bar.add_task("reading", total=1)
+    with progress_bar(quiet=json) as report:
         for file in listed:
             case = load_case(file, hand=hand, obj=object)
             if copies and (case.placed is None) == (protocol == "lift"):
                 needed = "--protocol lift for grasps in scenes, or dexgraspbench for free grasps"
                 raise InputError(f"{file}: -o needs {needed}")
-            run = ExecutionContext(threads=threads, progress=partial(_update_bar, bar, task, case.name))
+            run = ExecutionContext(threads=threads, progress=partial(_report_progress, report, case.name))
             if several:
                 if protocol == "lift" and case.placed is None:
                     raise InputError(f"{file} has free grasps, but a lift test needs a scene: graspd synth --scene")
@@ -140,8 +136,8 @@ def _format_robustness(whole: dict[str, Any]) -> str:
     return f"robust: {whole['robust_n']} held grasps hold in {models}\nby perturbed parameter: {each}"
 
 
-def _update_bar(bar: Progress, task: TaskID, name: str, done: float, total: float, what: str) -> None:
-    bar.update(task, completed=done, total=total, description=f"{name}: {what}")
+def _report_progress(report: Progress, name: str, done: float, total: float, what: str) -> None:
+    report(done, total, f"{name}: {what}")
 
 
 def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:

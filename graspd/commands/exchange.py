@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json as jsonlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from graspd.exchange.opening import check_written_files
 from graspd.exchange.plan import ExportSummary
-from graspd.service.cli import CommandGroup, DataDir, JsonFlag, load_settings, plain_console, print_result
+from graspd.service.cli import CommandGroup, DataDir, JsonFlag, load_settings, print_result, progress_bar
 from graspd.service.model.errors import InputError, choices_text
 from graspd.service.store import validity
 from graspd.service.store.shards import read_shard
@@ -92,9 +90,12 @@ def export(
             done = _export_webdataset(source, output, unvalidated=unvalidated, every=every)
         else:
             done = _export_pictures(Path(source), format_, depth, output)
-    told = {"folder": str(output), "format": format_, **done.counts, **({"notes": done.notes} if done.notes else {})}
+    _report({"folder": str(output), "format": format_}, output, done, json=json)
+
+
+def _report(told: dict[str, Any], output: Path, done: ExportSummary, *, json: bool) -> None:
     line = f"{output}: " + ", ".join(f"{n} {what}" for what, n in done.counts.items() if isinstance(n, int))
-    print_result(told, line, json=json)
+    print_result(told | done.counts | ({"notes": done.notes} if done.notes else {}), line, json=json)
     for note in () if json else done.notes:
         typer.echo(note, err=True)
 
@@ -225,10 +226,7 @@ def simready(
     from graspd.exchange.simready import write_simready
 
     done = write_simready(source, grasps, output, best=best)
-    told = {"file": str(output), **done.counts, **({"notes": done.notes} if done.notes else {})}
-    print_result(told, f"{output}: " + ", ".join(f"{n} {what}" for what, n in done.counts.items()), json=json)
-    for note in () if json else done.notes:
-        typer.echo(note, err=True)
+    _report({"file": str(output)}, output, done, json=json)
 
 
 SourceName = Annotated[str, typer.Argument(metavar="NAME", help="Dataset of the store, or folder: ./kitchen-v1.")]
@@ -253,9 +251,9 @@ def card(
     from graspd.studies.cards.card import write_card
 
     contents = _contents(source, snapshot, assets, data_dir)
-    with _progress(json=json) as report:
+    with progress_bar(quiet=json) as report:
         found = write_card(
-            contents, out, licence=licence, source=text, progress=lambda done, total: report("shards", done, total)
+            contents, out, licence=licence, source=text, progress=lambda done, total: report(done, total, "shards")
         )
     made = found["composition"]
     told = {"out": str(out), "dataset": found["name"], "snapshot": (found["snapshot"] or {}).get("digest")}
@@ -295,7 +293,7 @@ def publish(
     folder = Path(hub.repository.split("/")[1] if hub else to)
     contents = _contents(source, snapshot, assets, data_dir)
     options = PublicationOptions(licence, text, every, held_out, tars, accept)
-    with _progress(json=json) as report:
+    with progress_bar(quiet=json) as report:
         write_publication(contents, folder, options, report, name=hub.repository if hub else "")
     address = hub.upload(folder, public=public) if hub else ""
     files = sorted(str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file())
@@ -314,13 +312,3 @@ def _contents(source: str, snapshot: str | None, assets: Path | None, data_dir: 
         store = open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False)
         contents = contents_of_store(store, source, snapshot)
     return contents if assets is None else add_provenance(contents, assets)
-
-
-@contextmanager
-def _progress(*, json: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Show the current step with its finished and all parts."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = plain_console(stderr=True)
-    with Progress(*columns, console=console, disable=json or not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("")
-        yield lambda step, done, total: bar.update(task, description=step, completed=done, total=total)

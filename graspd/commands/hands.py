@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from json import dumps
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
+from graspd.service.cli import CommandGroup, JsonFlag, print_json, progress_bar
 from graspd.service.command_options import with_options
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.states import AssetKind
@@ -40,8 +37,8 @@ def check(
 ) -> None:
     """Check whether a hand can be used, report guesses, and run the self-test. Needs no server."""
     options = hand_options(**options)
-    with _progress_bar("reading     ", quiet=json) as run:
-        report = report_hand(file, options, run)
+    with progress_bar(quiet=json) as progress:
+        report = report_hand(file, options, ExecutionContext(progress=progress))
     if picture and report["verdict"] != "refuse":
         _write_picture(hand_from_path(file, options), picture, collision=collision)
     if write and report["verdict"] != "refuse":
@@ -62,21 +59,9 @@ def check(
 def _self_test(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]:
     from graspd.worker.stages.hand_self_test import self_test_facts
 
-    with _progress_bar("self-test   ", "starting; the first run on a machine compiles its kernels", quiet=quiet) as run:
-        return self_test_facts(lambda: hand_from_path(file, options), run)
-
-
-@contextmanager
-def _progress_bar(what: str, first: str = "", *, quiet: bool) -> Iterator[ExecutionContext]:
-    """Yield a context whose progress is shown on a terminal."""
-    columns = (TextColumn(f"  {what}       {{task.description}}", markup=False), BarColumn(), TimeElapsedColumn())
-    console = plain_console(stderr=True)
-    # Outside a terminal, the end of the progress bar would print an empty line.
-    with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
-        task = bar.add_task(first, total=1.0)
-        yield ExecutionContext(
-            progress=lambda done, total, message: bar.update(task, completed=done / total, description=message)
-        )
+    with progress_bar(quiet=quiet) as progress:
+        progress(0.0, 1.0, "starting the self-test; the first run on a machine compiles its kernels")
+        return self_test_facts(lambda: hand_from_path(file, options), ExecutionContext(progress=progress))
 
 
 def _write_picture(hand: HandModel, picture: Path, *, collision: bool) -> None:

@@ -16,10 +16,9 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.progress import track
 
 from graspd.service import user_cache
-from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
+from graspd.service.cli import CommandGroup, JsonFlag, print_json, progress_bar
 from graspd.service.command_options import with_options
 from graspd.service.model.cores import available_cores
 from graspd.service.model.errors import GraspdError, InputError
@@ -138,11 +137,10 @@ def _prepare_set(objects: Objects, published: PublishedSet, folder: Path) -> Ite
     """Yield the check of each object, and write accepted ones with their `asset.json`; earlier checks are reused."""
     waiting = {name: files for name, files in objects.items() if _held_record(folder / name) is None}
     tasks = [(name, files, published, folder / name) for name, files in waiting.items()]
-    with ProcessPoolExecutor(available_cores(), mp_context=get_context("spawn")) as pool:
-        console = plain_console(stderr=True)
-        done = pool.map(_prepare_object, tasks, chunksize=4)
-        for _ in track(done, "checking", len(tasks), console=console, disable=not console.is_terminal):
-            pass
+    workers = ProcessPoolExecutor(available_cores(), mp_context=get_context("spawn"))
+    with workers as pool, progress_bar(quiet=False) as progress:
+        for number, _ in enumerate(pool.map(_prepare_object, tasks, chunksize=4), start=1):
+            progress(number, len(tasks), "checking")
     for name in objects:
         if (record := _held_record(folder / name)) is not None:
             yield {"name": name, **record}

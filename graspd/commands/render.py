@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import getpass
 import os
-import signal
 import socket
-import threading
 from contextlib import closing
 from pathlib import Path
 from time import perf_counter
@@ -15,14 +13,14 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from graspd.commands.grasp_sheet import GraspAnimation, GraspSheet, Kind
-from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_result, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, print_result, progress_bar, write_output
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import scene_supports
 from graspd.service.model.transforms import compose
 from graspd.service.readers.trajectories import scene_spec_of, wrist_angles
+from graspd.service.run.commands import stop_on_signals
 from graspd.service.store import validity
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.engines.devices import Device
@@ -87,9 +85,7 @@ def render(
         drawn=_best_grasps(scene, hand) if scene.kind == "base" else _hand_in_pictures(scene, with_hand, hand),
         supports=TABLE if spec is None else scene_supports(spec),
     )
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
-        task = bar.add_task("rendering", total=None)
+    with progress_bar(quiet=json) as progress:
         result = render_views(
             obj,
             np.asarray(scene["scene/object_pose"], float),
@@ -100,9 +96,7 @@ def render(
             seed=number,
             baseline_m=baseline,
             extras=extras,
-            run=ExecutionContext(
-                used, progress=lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
-            ),
+            run=ExecutionContext(used, progress=progress),
         )
     seconds = perf_counter() - started
     inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
@@ -227,9 +221,7 @@ def view(
         raise InputError(said)
     base = read_shard(grasps, kind="base")
     shown = ViewerContent(base, hand_of_shard(base, hand), object_of_shard(base, object), neighbours_of_shard(base, []))
-    ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
+    ended = stop_on_signals()
     with closing(Viewer(shown, host=host, port=port)) as viewer:
         typer.echo(f"{grasps}: {viewer.url}")
         command = forwarding_command(viewer.server.get_port())

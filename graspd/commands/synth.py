@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -17,9 +14,6 @@ from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.metrics import DIRECTION_CELLS
 from graspd.service.store.shards import write_shard
-
-if TYPE_CHECKING:
-    from graspd.worker.execution_context import Progress as Report
 
 app = cli.CommandGroup()
 FEWER: Final = 3
@@ -49,8 +43,13 @@ def synth(
     asked = validate_options(LocalOptions, options)
     if "payload" not in options and asked.scene_spec.kind != "free" and asked.validation != "none":
         asked = asked.model_copy(update={"payload": asked.mass is not None or asked.density is not None})
-    settings = cli.engine_settings()
-    with cli.catch_stop_signals() as stop, _progress_bar(quiet=json) as progress:
+    settings, began = cli.load_settings(), time.perf_counter()
+    with cli.catch_stop_signals() as stop, cli.progress_bar(quiet=json) as report:
+
+        def progress(done: float, total: float, message: str) -> None:
+            rate = done / max(time.perf_counter() - began, 1e-3)
+            report(done, total, f"{message}, {rate:.1f} grasps/s")
+
         try:
             made = synthesize_with_options(
                 hand,
@@ -72,28 +71,6 @@ def synth(
         cli.fail(f"interrupted: {out} contains {found['grasps']} of {asked.grasps} grasps", 128 + stop[0])
     if made.reason is not None:
         raise typer.Exit(FEWER)
-
-
-@contextmanager
-def _progress_bar(*, quiet: bool) -> Iterator[Report]:
-    """Show a progress bar on a terminal; yield the callback that updates it."""
-    if quiet or not sys.stderr.isatty():
-        yield lambda done, total, message: None
-        return
-    # The library is imported only if the bar is shown.
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    began = time.perf_counter()
-    what, rate = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[rate]}")
-    columns = (what, BarColumn(), rate, TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=cli.plain_console(stderr=True), transient=True) as bar:
-        task = bar.add_task("starting", total=None, rate="")
-
-        def tell(done: float, total: float, message: str) -> None:
-            rate = f"{done / max(time.perf_counter() - began, 1e-3):.1f} grasps/s"
-            bar.update(task, completed=done, total=total, description=message, rate=rate)
-
-        yield tell
 
 
 def _format_robustness(found: dict[str, Any]) -> str:
@@ -127,10 +104,8 @@ def _format_summary(found: dict[str, Any]) -> str:
     if found.get("payload_kg") is not None:
         lines.append(f"median payload {found['payload_kg']:.2f} kg")
     if second := found.get("second_engines"):
-        line = (
-            f"{second['second_held']} of {second['second_tested']} valid grasps hold in {' and '.join(second['names'])}"
-        )
-        lines.append(line)
+        held = f"{second['second_held']} of {second['second_tested']} valid grasps"
+        lines.append(f"{held} hold in {' and '.join(second['names'])}")
     if found.get("shake_share") is not None:
         lines.append(f"{found['shake_share']:.0%} survive the shake")
     if "scene" in found:

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, load_settings, log_to_stderr, print_result, restrict_file_access
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, print_result, set_up_process
 from graspd.service.model.errors import InputError, UnavailableError
 from graspd.service.model.libraries import pause_garbage_collection
 from graspd.service.model.states import Stage
@@ -41,8 +41,7 @@ def worker(
     if workers > 1 and (burst or once or max_tasks is not None):
         raise InputError("--burst, --once and --max-tasks are for a single worker")
     settings = load_settings(device=device, threads=threads, join=join, processes=processes, data_dir=data_dir)
-    log_to_stderr(settings, "worker")
-    restrict_file_access(settings)
+    set_up_process(settings, "worker")
     if check:
         check_worker(settings)
         return

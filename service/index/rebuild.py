@@ -72,9 +72,9 @@ class _Rebuild:
 
     def add_assets(self) -> None:
         for kind, digest in stored_assets(self._store):
-            with self._skip_invalid(names.asset_check_key(kind, digest)):
+            with self._skip_invalid(names.asset_key(kind, digest, "check.json")):
                 check = load_check(self._store, kind, digest)
-                with self._skip_invalid(names.asset_record_key(kind, digest), "assets"):
+                with self._skip_invalid(names.asset_key(kind, digest, "asset.json"), "assets"):
                     self._index.write.add_asset(load_asset(self._store, kind, digest), check, within=self._connection)
 
     def add_jobs(self) -> None:

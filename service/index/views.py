@@ -84,9 +84,7 @@ class JobView(Validated):
         found = self.valid if request.counted_status == "valid" else self.grasps
         if self.state is not State.SUCCEEDED or request.want != "valid":
             return None
-        return explain_shortfall(
-            found, request.grasps, request.counted_status, self.candidates, request.budget, self.outcomes
-        )
+        return explain_shortfall(request, found, self.candidates, self.outcomes)
 
 
 class TaskView(View):
@@ -327,10 +325,8 @@ class DatasetView(Validated):
     def reason(self) -> str | None:
         if not self.state.is_final or self.options.want != "valid":
             return None
-        options, found = self.options, self.counted_grasps
-        return explain_shortfall(
-            found, self.asked, options.counted_status, self.candidates, options.budget, self.outcomes
-        )
+        found = self.counted_grasps
+        return explain_shortfall(self.options, found, self.candidates, self.outcomes, wanted=self.asked)
 
     @property
     def counted_grasps(self) -> int:

@@ -64,6 +64,59 @@ _FIDELITY_HINT: Final = "draft: fastest; fine: most accurate; auto: meets the ta
 _SCENE_LABELS: Final = {"free": "free object", "table": "table", "bin": "bin", "shelf": "shelf"}
 _ENGINE_LABELS: Final = {"none": "none", "physx": "PhysX", "drake": "Drake", "all": "PhysX and Drake"}
 _TYPE_LABELS: Final = {name: name.replace("_", " ") for name in get_args(GraspTypeName)}
+#: Input of each option in the forms of the dashboard.
+FORM: Final[dict[str, FormField]] = {
+    "grasps": FormField("", "Number of grasps", "in batches of 32"),
+    "method": FormField("Planning", "Planner", "makes the candidates", {one: one for one in METHODS}),
+    "fidelity": FormField("Planning", "Fidelity", _FIDELITY_HINT, {one: one for one in (*OFFERED, AUTO)}),
+    "seed": FormField("Planning", "Seed", "same seed, same grasps"),
+    "scene": FormField("", "Scene", "of planning and validation", choices=_SCENE_LABELS, cells=True),
+    "faces": FormField("Scene", "Resting face", "of the object", _FACE_LABELS, cells=True),
+    "neighbours": FormField(
+        "Scene", "Neighbours", "up to 8 names; empty: none", placeholder="block, bottle", cells=True
+    ),
+    "touch": FormField(
+        "Scene", "Fingertip clearance", "to supports; 0: contact allowed, 2: as for the hand", cells=True
+    ),
+    "scenes": FormField("Scene", "Scenes", "per batch; 0: none if the scene is free, else 4"),
+    "views": FormField("Pictures", "Views", "camera placements per scene"),
+    "stereo": FormField("Pictures", "Cameras", "Stereo: left and right eye"),
+    "width": FormField("Pictures", "Width", "of each picture"),
+    "height": FormField("Pictures", "Height", "of each picture"),
+    "channels": FormField(
+        "Pictures", "Further channels", "besides colour, depth and labels", placeholder="distance, normals"
+    ),
+    "type": FormField("Grasp", "Grasp type", "", _TYPE_LABELS, cells=True),
+    "digits": FormField("Grasp", "Digits", "that may touch; empty: all", placeholder="thumb, index"),
+    "touch_region": FormField("Grasp", "Contact region", "bounds, part or colour", placeholder="z > 0.05", cells=True),
+    "avoid_region": FormField("Grasp", "Avoided region", "without contacts", placeholder="z > 0.1"),
+    "approach_cone": FormField(
+        "Grasp", "Approach cone", "axis and angle; empty: any", placeholder="0, 0, -1, 30", cells=True
+    ),
+    "like": FormField(
+        "Grasp", "Wrist pose", "x, y, z, quaternion wxyz", placeholder="0, 0, 0.1, 1, 0, 0, 0", cells=True
+    ),
+    "friction": FormField("Object", "Friction of the metrics", "Coulomb coefficient"),
+    "mass": FormField("Object", "Mass", "empty: its own, else 0.1 kg"),
+    "density": FormField("Object", "Density", "instead of the mass"),
+    "object_friction": FormField("Object", "Friction in simulation", "Coulomb; empty: its own, else 0.6"),
+    "want": FormField("Planning", "Counted grasps", "", _WANT_LABELS),
+    "budget": FormField("Planning", "Budget", "candidates per requested valid grasp"),
+    "min_distance": FormField("Planning", "Least distance", "of two grasps of a batch; 0: no limit", cells=True),
+    "validation": FormField("Validation", "Level", "of validation in MuJoCo", _LEVEL_LABELS),
+    "rechecks": FormField("Validation", "Rechecks", "valid grasps, at level dexgraspbench"),
+    "robust": FormField("Validation", "Robust share", "of perturbed models that must hold; 0: none", cells=True),
+    "robust_models": FormField("Validation", "Perturbed models", "per valid grasp; 0: 8 if a share is given"),
+    "payload": FormField("Validation", "Payload", "Measure it for each valid grasp"),
+    "min_payload": FormField(
+        "Validation", "Least payload", "mass that a grasp must lift to count; 0: no requirement", cells=True
+    ),
+    "shake": FormField("Validation", "After the lift", "Shake: 2 cm, 3 Hz", cells=True),
+    "second_engine": FormField("Validation", "Second engine", "for a share of the grasps", _ENGINE_LABELS, cells=True),
+    "second_engine_share": FormField("Validation", "Second engine's share", "of the valid grasps"),
+    "options": FormField("Planning", "Options of the planner", "name=value; empty: none", placeholder="steps=20000"),
+    "target": FormField("Planning", "Target", "of fidelity auto", placeholder="gsr>=0.6"),
+}
 NO_NEIGHBOURS: Final = "second engines simulate no neighbours: only mujoco does"
 SHAKE_NEEDS_A_SCENE: Final = "shake needs a lift out of a scene: choose a scene, such as table"
 
@@ -72,14 +125,19 @@ SHAKE_NEEDS_A_SCENE: Final = "shake needs a lift out of a scene: choose a scene,
 REQUIREMENTS: Final = ("type", "digits", "touch_region", "avoid_region", "approach_cone", "like")
 SecondEngine = Literal["none", "physx", "drake", "all"]
 DigitName = Literal["thumb", "index", "middle", "ring", "little", "sixth"]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 Region = Annotated[str, Field(max_length=200), AfterValidator(lambda text: text and parse_region(text) and text)]
 Cone = Annotated[str, Field(max_length=80), AfterValidator(lambda text: text and parse_cone(text) and text)]
 WristPose = Annotated[str, Field(max_length=160), AfterValidator(lambda text: text and parse_pose(text) and text)]
 
 
-def _sparse_field(default: Any, **facts: Any) -> Any:
+def _field(default: Any, description: str, **bounds: Any) -> Any:
+    return Field(default, description=description, **bounds)
+
+
+def _sparse_field(default: Any, description: str, **bounds: Any) -> Any:
     """Return a field that JSON omits at its default: new fields change no ids and records of old jobs."""
-    return Field(default, exclude_if=lambda value: value == default, **facts)
+    return _field(default, description, exclude_if=lambda value: value == default, **bounds)
 
 
 class JobOptions(Model):
@@ -88,237 +146,150 @@ class JobOptions(Model):
     SUBMITTED: ClassVar[bool] = False
     """True for jobs of a service; False for work in this process."""
 
-    grasps: Annotated[
-        int, Option("basic", flags="--grasps -n"), FormField("", "Number of grasps", "in batches of 32")
-    ] = Field(32, ge=1, le=1_000_000, description="number of grasps; in a dataset, for each pair of hand and object")
-    method: Annotated[
-        Name, Option("basic"), FormField("Planning", "Planner", "makes the candidates", {one: one for one in METHODS})
-    ] = Field("fast_graspd", description=f"planner: {', '.join(METHODS)}, or one of another package")
-    fidelity: Annotated[
-        str | Fidelity,
-        Option("basic"),
-        FormField("Planning", "Fidelity", _FIDELITY_HINT, {one: one for one in (*OFFERED, AUTO)}),
-    ] = Field("standard", description=f"{', '.join(OFFERED)}, or auto with a target")
-    seed: Annotated[int, Option("basic"), FormField("Planning", "Seed", "same seed, same grasps")] = Field(
-        0, ge=0, lt=2**31, description="the same seed gives the same grasps"
+    grasps: Annotated[int, Option("basic", flags="--grasps -n")] = _field(
+        32, "number of grasps; in a dataset, for each pair of hand and object", ge=1, le=1_000_000
     )
+    method: Annotated[Name, Option("basic")] = _field(
+        "fast_graspd", f"planner: {', '.join(METHODS)}, or one of another package"
+    )
+    fidelity: Annotated[str | Fidelity, Option("basic")] = _field(
+        "standard", f"{', '.join(OFFERED)}, or auto with a target"
+    )
+    seed: Annotated[int, Option("basic")] = _field(0, "the same seed gives the same grasps", ge=0, lt=2**31)
     scene: Annotated[
-        SceneOption,
-        Option("basic", typed="scene of the grasps: free, table, bin, shelf, or a JSON or YAML file"),
-        FormField("", "Scene", "of planning and validation", choices=_SCENE_LABELS, cells=True),
+        SceneOption, Option("basic", typed="scene of the grasps: free, table, bin, shelf, or a JSON or YAML file")
     ] = _sparse_field(
         "free",
-        description="scene in which grasps are planned, validated, rendered and counted: free (a floating object), "
+        "scene in which grasps are planned, validated, rendered and counted: free (a floating object), "
         "table, bin, shelf, or JSON with supports",
     )
-    faces: Annotated[
-        Literal["drawn", "all"], Option(), FormField("Scene", "Resting face", "of the object", _FACE_LABELS, cells=True)
-    ] = _sparse_field(
+    faces: Annotated[Literal["drawn", "all"], Option()] = _sparse_field(
         "drawn",
-        description="resting faces of the object. drawn: with their frequency after drops; all: one scene for each "
+        "resting faces of the object. drawn: with their frequency after drops; all: one scene for each "
         "stable face, regardless of `scenes`",
     )
     neighbours: Annotated[
         tuple[BesideOption, ...],
         Option("basic", flags="--with", typed="neighbour in each scene: a name, or for graspd submit a mesh; up to 8"),
-        FormField("Scene", "Neighbours", "up to 8 names; empty: none", placeholder="block, bottle", cells=True),
     ] = _sparse_field(
         (),
+        "names of up to eight neighbours, dropped around the object; a scene with supports places its own",
         max_length=MOST_NEIGHBOURS,
-        description="names of up to eight neighbours, dropped around the object; a scene with supports places its own",
     )
-    touch: Annotated[
-        Touch,
-        Option(),
-        FormField("Scene", "Fingertip clearance", "to supports; 0: contact allowed, 2: as for the hand", cells=True),
-    ] = _sparse_field(
+    touch: Annotated[Touch, Option()] = _sparse_field(
         TOUCH,
-        description="clearance of fingertips to supports [mm]. 2: as for the rest of the hand; 0: contact allowed; "
+        "clearance of fingertips to supports [mm]. 2: as for the rest of the hand; 0: contact allowed; "
         "negative: fingertips may press into the support, for flat objects",
     )
-    scenes: Annotated[
-        int, Option("basic"), FormField("Scene", "Scenes", "per batch; 0: none if the scene is free, else 4")
-    ] = Field(0, ge=0, le=64, description=f"scenes per batch; 0: none if the scene is free, else {SCENES}")
-    views: Annotated[
-        int, Option("basic", places=JOB), FormField("Pictures", "Views", "camera placements per scene")
-    ] = Field(0, ge=0, le=256, description="camera placements per scene")
-    stereo: Annotated[bool, Option(places=JOB), FormField("Pictures", "Cameras", "Stereo: left and right eye")] = Field(
-        False, description="render a left and a right picture per placement"
+    scenes: Annotated[int, Option("basic")] = _field(
+        0, f"scenes per batch; 0: none if the scene is free, else {SCENES}", ge=0, le=64
     )
-    width: Annotated[int, Option(places=JOB), FormField("Pictures", "Width", "of each picture")] = Field(
-        320, ge=16, le=4096, description="picture width [px]"
+    views: Annotated[int, Option("basic", places=JOB)] = _field(0, "camera placements per scene", ge=0, le=256)
+    stereo: Annotated[bool, Option(places=JOB)] = _field(False, "render a left and a right picture per placement")
+    width: Annotated[int, Option(places=JOB)] = _field(320, "picture width [px]", ge=16, le=4096)
+    height: Annotated[int, Option(places=JOB)] = _field(240, "picture height [px]", ge=16, le=4096)
+    channels: Annotated[tuple[Literal["distance", "normals", "occlusion"], ...], Option(places=JOB)] = _field(
+        (), "image channels besides colour, depth and segmentation: distance, normals or occlusion"
     )
-    height: Annotated[int, Option(places=JOB), FormField("Pictures", "Height", "of each picture")] = Field(
-        240, ge=16, le=4096, description="picture height [px]"
-    )
-    channels: Annotated[
-        tuple[Literal["distance", "normals", "occlusion"], ...],
-        Option(places=JOB),
-        FormField("Pictures", "Further channels", "besides colour, depth and labels", placeholder="distance, normals"),
-    ] = Field((), description="image channels besides colour, depth and segmentation: distance, normals or occlusion")
-    type: Annotated[
-        GraspTypeName, Option("basic", schema=7), FormField("Grasp", "Grasp type", "", _TYPE_LABELS, cells=True)
-    ] = _sparse_field(
+    type: Annotated[GraspTypeName, Option("basic", schema=7)] = _sparse_field(
         "any",
-        description="type of the grasps by contact: power, precision, pinch, lateral, or a type of the GRASP taxonomy. "
+        "type of the grasps by contact: power, precision, pinch, lateral, or a type of the GRASP taxonomy. "
         "balanced: power, precision and pinch in turn, one per batch",
     )
     digits: Annotated[
-        tuple[DigitName, ...],
-        Option(schema=7, typed="digit that may touch, such as thumb; the others stay open"),
-        FormField("Grasp", "Digits", "that may touch; empty: all", placeholder="thumb, index"),
-    ] = _sparse_field((), max_length=6, description="digits that may touch: thumb, index, middle, ring, little")
-    touch_region: Annotated[
-        Region,
-        Option(schema=7),
-        FormField("Grasp", "Contact region", "bounds, part or colour", placeholder="z > 0.05", cells=True),
-    ] = _sparse_field(
+        tuple[DigitName, ...], Option(schema=7, typed="digit that may touch, such as thumb; the others stay open")
+    ] = _sparse_field((), "digits that may touch: thumb, index, middle, ring, little", max_length=6)
+    touch_region: Annotated[Region, Option(schema=7)] = _sparse_field(
         "",
-        description="region of all contacts: bounds in the object's frame [m], such as z > 0.05, x < 0.02. part NAME: "
+        "region of all contacts: bounds in the object's frame [m], such as z > 0.05, x < 0.02. part NAME: "
         "a group, object or material of an OBJ; a node, mesh or material of a GLB. color #rrggbb: faces of this colour",
     )
-    avoid_region: Annotated[
-        Region, Option(schema=7), FormField("Grasp", "Avoided region", "without contacts", placeholder="z > 0.1")
-    ] = _sparse_field("", description="region without contacts: bounds [m] such as z > 0.1, part NAME or color #rrggbb")
-    approach_cone: Annotated[
-        Cone,
-        Option(schema=7),
-        FormField("Grasp", "Approach cone", "axis and angle; empty: any", placeholder="0, 0, -1, 30", cells=True),
-    ] = _sparse_field(
+    avoid_region: Annotated[Region, Option(schema=7)] = _sparse_field(
+        "", "region without contacts: bounds [m] such as z > 0.1, part NAME or color #rrggbb"
+    )
+    approach_cone: Annotated[Cone, Option(schema=7)] = _sparse_field(
         "",
-        description="cone of the palm's approach: axis and largest angle [deg], such as 0, 0, -1, 30. The axis is in "
+        "cone of the palm's approach: axis and largest angle [deg], such as 0, 0, -1, 30. The axis is in "
         "the frame of the scene, or of a free object",
     )
-    like: Annotated[
-        WristPose,
-        Option(schema=7),
-        FormField("Grasp", "Wrist pose", "x, y, z, quaternion wxyz", placeholder="0, 0, 0.1, 1, 0, 0, 0", cells=True),
-    ] = _sparse_field(
+    like: Annotated[WristPose, Option(schema=7)] = _sparse_field(
         "",
-        description="demonstrated wrist pose x, y, z, qw, qx, qy, qz in the object's frame [m]. Grasps start around it "
+        "demonstrated wrist pose x, y, z, qw, qx, qy, qz in the object's frame [m]. Grasps start around it "
         "and stay within 4 cm and 30 degrees",
     )
-    friction: Annotated[float, Option(), FormField("Object", "Friction of the metrics", "Coulomb coefficient")] = Field(
-        1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics"
+    friction: Annotated[float, Option()] = _field(1.0, "Coulomb coefficient of the quality metrics", gt=0, le=3)
+    mass: Annotated[Mass | None, Option("basic", schema=5)] = _sparse_field(
+        None, f"mass of the object [kg]; default: its own, else {MASS_KG:g} kg"
     )
-    mass: Annotated[
-        Mass | None, Option("basic", schema=5), FormField("Object", "Mass", "empty: its own, else 0.1 kg")
-    ] = _sparse_field(None, description=f"mass of the object [kg]; default: its own, else {MASS_KG:g} kg")
-    density: Annotated[Density | None, Option(schema=5), FormField("Object", "Density", "instead of the mass")] = (
-        _sparse_field(None, description="density of the object [kg/m^3], instead of the mass")
+    density: Annotated[Density | None, Option(schema=5)] = _sparse_field(
+        None, "density of the object [kg/m^3], instead of the mass"
     )
-    object_friction: Annotated[
-        Friction | None,
-        Option(schema=5),
-        FormField("Object", "Friction in simulation", "Coulomb; empty: its own, else 0.6"),
-    ] = _sparse_field(
-        None, description=f"Coulomb coefficient of contacts in simulation; default: the object's own, else {FRICTION:g}"
+    object_friction: Annotated[Friction | None, Option(schema=5)] = _sparse_field(
+        None, f"Coulomb coefficient of contacts in simulation; default: the object's own, else {FRICTION:g}"
     )
-    want: Annotated[
-        Literal["valid", "candidates"], Option("basic"), FormField("Planning", "Counted grasps", "", _WANT_LABELS)
-    ] = Field("valid", description="grasps that count: valid (without validation: feasible) ones, or all candidates")
-    budget: Annotated[float, Option(), FormField("Planning", "Budget", "candidates per requested valid grasp")] = Field(
-        4.0, ge=1, le=100, description="maximum number of candidates per requested valid grasp"
+    want: Annotated[Literal["valid", "candidates"], Option("basic")] = _field(
+        "valid", "grasps that count: valid (without validation: feasible) ones, or all candidates"
     )
-    min_distance: Annotated[
-        float, Option(), FormField("Planning", "Least distance", "of two grasps of a batch; 0: no limit", cells=True)
-    ] = _sparse_field(
+    budget: Annotated[float, Option()] = _field(
+        4.0, "maximum number of candidates per requested valid grasp", ge=1, le=100
+    )
+    min_distance: Annotated[Finite, Option()] = _sparse_field(
         MIN_DISTANCE_M,
+        "least distance to earlier grasps of the batch [m]: mean over corresponding points of the hand, in "
+        "the object's frame. With want valid, nearer grasps are rejected; 0: no limit",
         ge=0,
         le=0.1,
-        allow_inf_nan=False,
-        description="least distance to earlier grasps of the batch [m]: mean over corresponding points of the hand, in "
-        "the object's frame. With want valid, nearer grasps are rejected; 0: no limit",
     )
-    validation: Annotated[
-        Literal["dexgraspbench", "standard", "fast", "none"],
-        Option("basic"),
-        FormField("Validation", "Level", "of validation in MuJoCo", _LEVEL_LABELS),
-    ] = Field(
-        "standard",
-        description="level of validation in MuJoCo. fast: MuJoCo Warp on a GPU decides clear cases; none: no verdicts",
+    validation: Annotated[Literal["dexgraspbench", "standard", "fast", "none"], Option("basic")] = _field(
+        "standard", "level of validation in MuJoCo. fast: MuJoCo Warp on a GPU decides clear cases; none: no verdicts"
     )
-    rechecks: Annotated[
-        int, Option(places=JOB), FormField("Validation", "Rechecks", "valid grasps, at level dexgraspbench")
-    ] = Field(
+    rechecks: Annotated[int, Option(places=JOB)] = _field(
         RECHECKS,
+        "number of valid grasps validated again at level dexgraspbench. The default checks one grasp in "
+        f"64, at most {RECHECKS}, in a twentieth of the job's time; other numbers check the first valid grasps",
         ge=0,
         le=10_000,
-        description="number of valid grasps validated again at level dexgraspbench. The default checks one grasp in "
-        f"64, at most {RECHECKS}, in a twentieth of the job's time; other numbers check the first valid grasps",
     )
-    robust: Annotated[
-        float,
-        Option("basic"),
-        FormField("Validation", "Robust share", "of perturbed models that must hold; 0: none", cells=True),
-    ] = _sparse_field(
+    robust: Annotated[Finite, Option("basic")] = _sparse_field(
         0.0,
+        "share of perturbed models in which a grasp must hold to count; 0: no requirement. With want "
+        "candidates, all grasps are stored",
         ge=0,
         le=1,
-        allow_inf_nan=False,
-        description="share of perturbed models in which a grasp must hold to count; 0: no requirement. With want "
-        "candidates, all grasps are stored",
     )
-    robust_models: Annotated[
-        int, Option(), FormField("Validation", "Perturbed models", "per valid grasp; 0: 8 if a share is given")
-    ] = _sparse_field(
+    robust_models: Annotated[int, Option()] = _sparse_field(
         0,
+        f"number of perturbed models per valid grasp; 0: {ROBUST_MODELS} if `robust` is given, else none",
         ge=0,
         le=MOST_ROBUST_MODELS,
-        description=f"number of perturbed models per valid grasp; 0: {ROBUST_MODELS} if `robust` is given, else none",
     )
-    payload: Annotated[
-        bool, Option(schema=5), FormField("Validation", "Payload", "Measure it for each valid grasp")
-    ] = _sparse_field(False, description="measure the payload of valid grasps")
-    min_payload: Annotated[
-        float,
-        Option(schema=5),
-        FormField("Validation", "Least payload", "mass that a grasp must lift to count; 0: no requirement", cells=True),
-    ] = _sparse_field(
-        0.0,
-        ge=0,
-        le=MOST_KG,
-        allow_inf_nan=False,
-        description="mass that a grasp must lift to count [kg], which implies `payload`; 0: no requirement",
+    payload: Annotated[bool, Option(schema=5)] = _sparse_field(False, "measure the payload of valid grasps")
+    min_payload: Annotated[Finite, Option(schema=5)] = _sparse_field(
+        0.0, "mass that a grasp must lift to count [kg], which implies `payload`; 0: no requirement", ge=0, le=MOST_KG
     )
-    shake: Annotated[
-        bool, Option(schema=5), FormField("Validation", "After the lift", "Shake: 2 cm, 3 Hz", cells=True)
-    ] = _sparse_field(False, description="shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y")
-    second_engine: Annotated[
-        SecondEngine,
-        Option("basic", schema=SCHEMA_OF_ENGINES),
-        FormField("Validation", "Second engine", "for a share of the grasps", _ENGINE_LABELS, cells=True),
-    ] = _sparse_field(
+    shake: Annotated[bool, Option(schema=5)] = _sparse_field(
+        False, "shake each valid grasp after its lift: 2 cm, 3 Hz, along x and y"
+    )
+    second_engine: Annotated[SecondEngine, Option("basic", schema=SCHEMA_OF_ENGINES)] = _sparse_field(
         "none",
-        description="engine besides MuJoCo that validates a share of the valid grasps: physx, drake, or all. With "
+        "engine besides MuJoCo that validates a share of the valid grasps: physx, drake, or all. With "
         "`robust`, only grasps that all named engines hold count",
     )
-    second_engine_share: Annotated[
-        float, Option(schema=SCHEMA_OF_ENGINES), FormField("Validation", "Second engine's share", "of the valid grasps")
-    ] = _sparse_field(
-        0.1,
-        gt=0,
-        le=1,
-        allow_inf_nan=False,
-        description="share of a batch's valid grasps that the second engine validates; with `robust` all",
+    second_engine_share: Annotated[Finite, Option(schema=SCHEMA_OF_ENGINES)] = _sparse_field(
+        0.1, "share of a batch's valid grasps that the second engine validates; with `robust` all", gt=0, le=1
     )
     options: Annotated[
         dict[
             Annotated[str, Field(max_length=40)],
-            Annotated[int, Field(ge=-(2**53), le=2**53)]
-            | Annotated[float, Field(allow_inf_nan=False)]
-            | Annotated[str, Field(max_length=80)],
+            Annotated[int, Field(ge=-(2**53), le=2**53)] | Finite | Annotated[str, Field(max_length=80)],
         ],
         Option(flags="--option", typed="option of the planner, such as steps=20000"),
-        FormField("Planning", "Options of the planner", "name=value; empty: none", placeholder="steps=20000"),
     ] = Field(default_factory=dict, max_length=16, description="options of the planner; see docs/how-to/planners.md")
-    target: Annotated[
-        str, Option(places=JOB), FormField("Planning", "Target", "of fidelity auto", placeholder="gsr>=0.6")
-    ] = Field(
+    target: Annotated[str, Option(places=JOB)] = _field(
         "",
-        max_length=40,
-        description="required accuracy, for which fidelity `auto` selects the cheapest one in the published chart: "
+        "required accuracy, for which fidelity `auto` selects the cheapest one in the published chart: "
         "gsr>=0.6, dexgraspbench>=0.9, pd_mm<=1; in a scene lift>=0.9, lift_hard or robust",
+        max_length=40,
     )
 
     @field_validator("fidelity")

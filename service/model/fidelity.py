@@ -17,10 +17,7 @@ class Fidelity(Model):
     coarse_points: int = Field(256, ge=16, le=8192, description="hand surface points in the first phase")
     fine_points: int = Field(2000, ge=16, le=32768, description="hand surface points in the second phase")
     object_points: int = Field(
-        4000,
-        ge=16,
-        le=65536,
-        description="object surface points tested against links; for free objects * 3, max 12,000",
+        4000, ge=16, le=65536, description="object surface points tested against links; for free objects * 3, max 12000"
     )
     face_error_m: float = Field(3e-4, ge=0, le=0.01, description="error bound of the simplified object [m]")
     coarse_iterations: int = Field(100, ge=0, le=100_000)

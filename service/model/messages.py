@@ -31,20 +31,25 @@ class Origin(Model):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class TaskMessage(Model):
-    """Message of a task; a worker needs no other data than this message and the store."""
-
+class _Message(Model):
     # The alias is needed because `schema` is a method of BaseModel.
     schema_: int = Field(alias="schema", description="oldest schema that can express the message")
     newest_schema: int = Field(0, ge=0, description="newest schema that the writer supports; 0: the same as `schema`")
     task_id: Word
+    attempt: int = Field(1, ge=1)
+    max_attempt: int = Field(3, ge=1, description="number of the last attempt")
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+
+class TaskMessage(_Message):
+    """Message of a task; a worker needs no other data than this message and the store."""
+
     job_id: Word
     stage: Stage
     batch: int = Field(ge=0, description="first batch of the range")
     count: int = Field(ge=1, description="requested grasps of the range; all batches but the last one are full")
     revision: int = Field(1, ge=1, description="revision of the stage's algorithm, part of the id of the output")
-    attempt: int = Field(1, ge=1)
-    max_attempt: int = Field(3, ge=1, description="number of the last attempt")
     request: JobRequest
     hand_digest: Digest
     object_digest: Digest
@@ -52,28 +57,19 @@ class TaskMessage(Model):
     output: Word = Field(description="id of the shard that the task writes")
     origin: Origin | None = None
 
-    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
-
     @model_validator(mode="after")
     def _check_digests(self) -> Self:
         check_digests(self.request)
         return self
 
 
-class IngestMessage(Model):
+class IngestMessage(_Message):
     """Message of a task that checks an uploaded hand, object or network in a child process."""
 
-    schema_: int = Field(alias="schema")
-    newest_schema: int = Field(0, ge=0)
-    task_id: Word
     stage: Literal[Stage.INGEST] = Stage.INGEST
     kind: AssetKind
     name: Name
     digest: Digest
-    attempt: int = Field(1, ge=1)
-    max_attempt: int = Field(3, ge=1)
-
-    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
 
 def message_type(raw: Mapping[str, Any]) -> type[TaskMessage | IngestMessage]:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 #: Column titles shorter than this are symbols, whose case has a meaning.
 _SYMBOL: Final = 4
@@ -73,6 +73,7 @@ class GraspMetric:
         return f"{words}, {self.unit}" if self.unit else words
 
 
+_CODE: Final[dict[str, Any]] = {"whole": True, "code": True, "optional": True}
 GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "epsilon",
@@ -211,9 +212,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "enum",
         "0 undefined, 1 power, 2 precision, 3 lateral; from the links in contact",
         title="Type",
-        whole=True,
-        code=True,
-        optional=True,
+        **_CODE,
         indexed=IndexLevel.SORTED,
         bounds=(0, 3),
     ),
@@ -222,9 +221,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "enum",
         "number of the type in the GRASP taxonomy, by the contacts; 0: none of the types with a rule",
         title="Taxonomy type",
-        whole=True,
-        code=True,
-        optional=True,
+        **_CODE,
         indexed=IndexLevel.KEPT,
         bounds=(0, 33),
     ),
@@ -233,9 +230,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "1",
         "digits in contact: sum of 1 thumb, 2 index, 4 middle, 8 ring, 16 little; without a thumb in the hand's order",
         title="Digits in contact",
-        whole=True,
-        code=True,
-        optional=True,
+        **_CODE,
         indexed=IndexLevel.KEPT,
         bounds=(0, 63),
     ),
@@ -273,9 +268,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "1",
         "direction of approach in the object's frame: one of 48 equal-area cells, 12 x band of height + azimuth sector",
         title="Approach cell",
-        whole=True,
-        code=True,
-        optional=True,
+        **_CODE,
         indexed=IndexLevel.KEPT,
         bounds=(0, 47),
     ),

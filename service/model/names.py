@@ -24,34 +24,12 @@ MARKS: Final = "marks"
 
 #: Kind of the shards of each stage: folder below `shards/` and HDF5 kind.
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
+STAGES: Final = {kind: stage for stage, kind in SHARD_KINDS.items()}
 
 
-def asset_files_key(kind: AssetKind, digest: str) -> str:
-    return f"{ASSETS}/{kind.value}/{digest}/files.zip"
-
-
-def asset_record_key(kind: AssetKind, digest: str) -> str:
-    return f"{ASSETS}/{kind.value}/{digest}/asset.json"
-
-
-def asset_check_key(kind: AssetKind, digest: str) -> str:
-    return f"{ASSETS}/{kind.value}/{digest}/check.json"
-
-
-def expanded_hand_key(digest: str) -> str:
-    return f"{ASSETS}/{AssetKind.HAND.value}/{digest}/expanded.json"
-
-
-def asset_model_key(kind: AssetKind, digest: str) -> str:
-    return f"{ASSETS}/{kind.value}/{digest}/model.glb"
-
-
-def prepared_object_key(digest: str, key: str) -> str:
-    return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/prepared/{key}.npz"
-
-
-def object_pieces_key(digest: str, key: str) -> str:
-    return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/pieces/{key}.npz"
+def asset_key(kind: AssetKind, digest: str, file: str) -> str:
+    """Return the key of a file of an asset, as `asset.json` (its record), `files.zip` or `check.json`."""
+    return f"{ASSETS}/{kind.value}/{digest}/{file}"
 
 
 def job_record_key(job: str) -> str:
@@ -86,10 +64,6 @@ def dataset_events_folder(dataset: str) -> str:
     return f"{DATASETS}/{dataset}/events"
 
 
-def event_key(events: str, number: int, what: str) -> str:
-    return f"{events}/{number:06}-{what}.json"
-
-
 def dataset_snapshots_folder(dataset: str) -> str:
     return f"{DATASETS}/{dataset}/snapshots"
 
@@ -112,10 +86,6 @@ def tag_versions_folder(tag: str) -> str:
 
 def tag_version_key(tag: str, number: int) -> str:
     return f"{tag_versions_folder(tag)}/{number:06}.json"
-
-
-def service_key(number: int) -> str:
-    return f"{SERVICE}/{number:06}.json"
 
 
 def mark_key(mark: str) -> str:

@@ -16,8 +16,8 @@ from graspd.service.model.errors import InputError
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
-#: Interfaces with an option: job of the service, command `graspd synth`, `graspd.synthesize`, file of an asset.
-Place = Literal["job", "synth", "python", "asset"]
+#: Interfaces with an option: job, command `graspd synth`, `graspd.synthesize`, file of an asset, limits of a key.
+Place = Literal["job", "synth", "python", "asset", "limit"]
 EVERYWHERE: Final[tuple[Place, ...]] = ("job", "synth", "python")
 JOB: Final[tuple[Place, ...]] = ("job",)
 _UNIT: Final = re.compile(r"\[([^\]]+)\]")
@@ -57,10 +57,6 @@ class OptionRow:
     name: str
     field: FieldInfo
     option: Option
-
-    @property
-    def form(self) -> FormField | None:
-        return next((one for one in self.field.metadata if isinstance(one, FormField)), None)
 
     @property
     def flags(self) -> list[str]:

@@ -273,16 +273,19 @@ def format_outcomes(outcomes: Mapping[str, int]) -> str:
 
 
 def explain_shortfall(
-    found: int, wanted: int, counted: str, candidates: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
+    options: JobOptions, found: int, candidates: int, outcomes: Mapping[str, int], *, wanted: int = 0, limit: str = ""
 ) -> str | None:
-    """Explain why fewer grasps were found than requested, else return None; `limit` replaces the budget."""
+    """Explain why fewer grasps than `wanted` (0: `options.grasps`) were found, else return None.
+
+    `limit` replaces the exhausted budget.
+    """
+    wanted = wanted or options.grasps
     if found >= wanted:
         return None
     lost, tries = format_outcomes(outcomes), candidates + outcomes.get("repeated", 0)
-    details = (
-        (f": {lost}" if lost else "") + "; " + (limit or f"the budget of {budget:g} candidates per grasp is exhausted")
-    )
-    return f"found {found:,} of {wanted:,} {counted} grasps in {tries:,} candidates{details}"
+    why = limit or f"the budget of {options.budget:g} candidates per grasp is exhausted"
+    counts = f"found {found:,} of {wanted:,} {options.counted_status} grasps in {tries:,} candidates"
+    return f"{counts}{f': {lost}' if lost else ''}; {why}"
 
 
 def payload_limit_text(

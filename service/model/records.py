@@ -51,7 +51,7 @@ class FidelityChoice(Record):
 class JobRecord(Record):
     """`job.json`: a request with the exact versions of hand and object, and the revision of each stage."""
 
-    version: Literal[1, 2] = 2
+    version: Literal[2] = 2
     id: Digest
     request: JobRequest
     revisions: dict[str, int] = Field(default_factory=lambda: dict(STAGE_REVISIONS))
@@ -66,15 +66,6 @@ class JobRecord(Record):
     choice: FidelityChoice | None = Field(
         None, exclude_if=lambda value: value is None, description="fidelity that a chart selected for `auto`"
     )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _convert_version_1(cls, data: Any) -> Any:
-        # Records of version 1 have neither validator nor revisions.
-        if isinstance(data, dict) and data.get("version") == 1:
-            request = {"want": "candidates", "validation": "none", **data.get("request", {})}
-            return {**data, "request": request, "revisions": dict.fromkeys(STAGE_REVISIONS, 1)}
-        return data
 
     @model_validator(mode="after")
     def _check_digests(self) -> Self:
@@ -207,8 +198,7 @@ class SnapshotShard(Record):
     @classmethod
     def _convert_pack_key(cls, key: str, info: ValidationInfo) -> str:
         # A key of graspd 0.2 may refer to a part of a pack; now each shard is a file.
-        stages = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
-        return names.shard_file_key(stages[info.data["kind"]], info.data["id"]) if "@" in key else key
+        return names.shard_file_key(names.STAGES[info.data["kind"]], info.data["id"]) if "@" in key else key
 
 
 class Snapshot(Record):

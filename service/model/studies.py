@@ -116,12 +116,6 @@ def count_outcomes(cells: Iterable[MapCell]) -> dict[Outcome, int]:
     return {outcome: outcomes.count(outcome) for outcome in OUTCOMES}
 
 
-def grade(value: float, weak: float, broken: float) -> Outcome:
-    if not value < broken:  # Also true for nan.
-        return "broken"
-    return "good" if value < weak else "weak"
-
-
 def mark_reachable(cells: Iterable[MapCell], where: Callable[[MapCell], bool]) -> list[MapCell]:
     return [replace(cell, reached=where(cell)) for cell in cells]
 

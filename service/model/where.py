@@ -15,6 +15,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import eq, ge, gt, le, lt, ne
 from typing import Final
 
 from graspd.service.model.errors import InputError, choices_text
@@ -29,7 +30,8 @@ _SHORT: Final = {"robust": "robust_share"}
 _WORDS: Final = ("hand", "object", "type")
 _TYPES: Final = tuple(kind.name.lower() for kind in GraspType)
 FLAGS: Final = ("validated", "valid", "feasible", "held", "lift", "lift_hard")
-_COMPARISONS: Final = {**{op: op for op in ("<", "<=", ">", ">=", "=", "!=")}, "==": "="}
+OPERATORS: Final = {"<": lt, "<=": le, ">": gt, ">=": ge, "=": eq, "!=": ne}
+_COMPARISONS: Final = {**{op: op for op in OPERATORS}, "==": "="}
 _TOKEN: Final = re.compile(
     r"\s*(?:(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?![\w.])|(?P<op><=|>=|==|!=|[<>=()])"
     r"|'(?P<quoted>[^']*)'|(?P<word>[A-Za-z0-9_][\w.\-]*))"

@@ -318,7 +318,7 @@ class Controller:
     def _queue_checks(self, present: set[str] | None, missing: Collection[str], now: float) -> None:
         for check in self._services.index.feed.ready_checks(now=now, limit=self._services.settings.queue_window):
             self._services.index.live.set_asset_waiting([check.digest], queued=True)
-            if self._services.store.exists(names.asset_check_key(check.kind, check.digest)):
+            if self._services.store.exists(names.asset_key(check.kind, check.digest, "check.json")):
                 with _log_failures([]):
                     self._indexer.index_asset(check.kind, check.digest)
             elif ingest_id(check.kind, check.digest) not in (present or ()):

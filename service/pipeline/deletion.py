@@ -27,7 +27,6 @@ from graspd.service.pipeline import job_actions, tagging
 from graspd.service.pipeline.backends import Services, record_transaction
 from graspd.service.store import records
 from graspd.service.store.library import load_asset, load_check
-from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
 RecordT = TypeVar("RecordT", bound=Record)
@@ -102,7 +101,7 @@ def move_to_removed(services: Services, deletion: records.Deletion) -> None:
                 services.store, records.released_key(deletion), records.DeletedJob(at=deletion.at, job=deletion.job)
             )
         attempts = [names.attempt_key(task, number) for task, number in deletion.attempts]
-        for key in [*attempts, *_record_last(_keys_below(services.store, record.rpartition("/")[0]), record)]:
+        for key in [*attempts, *_record_last(services.store.keys(record.rpartition("/")[0]), record)]:
             services.store.move(key, f"{folder}/{key}")
         services.store.delete(names.deletion_key(deletion.what, deletion.id))
 
@@ -143,7 +142,7 @@ def _restore(services: Services, deletion: records.Deletion, connection: Connect
     if not store.exists(waiting) and store.exists(record):
         called = deletion.id if deletion.what in ("job", "dataset") else deletion.name
         raise ConflictError(f"there is a {deletion.what} {called!r} again; delete that first")
-    moved = [key.removeprefix(f"{folder}/") for key in _keys_below(store, folder)]
+    moved = [key.removeprefix(f"{folder}/") for key in store.keys(folder)]
     for key in _record_last([key for key in moved if key != "deletion.json"], record):
         store.move(f"{folder}/{key}", key)
     try:
@@ -180,7 +179,7 @@ def _restore_rows(services: Services, deletion: records.Deletion, connection: Co
         # Only ended datasets are deleted: the end was reported before.
         told = max((action.number for action in actions), default=0)
         index.write_dataset.set_progress(dataset.name, told=told, within=connection)
-        for key in _keys_below(store, names.dataset_snapshots_folder(dataset.name)):
+        for key in store.keys(names.dataset_snapshots_folder(dataset.name)):
             index.write_dataset.add_snapshot(records.read_record(Snapshot, store, key), within=connection)
     else:
         kind = AssetKind(deletion.what)
@@ -207,7 +206,7 @@ def _restore_jobs(services: Services, deletion: records.Deletion, connection: Co
 
 def _restore_tag(services: Services, deletion: records.Deletion) -> None:
     folder = records.removed_folder(deletion)
-    key = next(key for key in _keys_below(services.store, folder) if not key.endswith("/deletion.json"))
+    key = next(key for key in services.store.keys(folder) if not key.endswith("/deletion.json"))
     tagging.restore_tag(services, records.read_record(Tag, services.store, key))
     for done in (key, f"{folder}/deletion.json"):
         services.store.delete(done)
@@ -225,11 +224,7 @@ def _record_key(deletion: records.Deletion) -> str:
         return names.job_record_key(deletion.id)
     if deletion.what == "dataset":
         return names.dataset_record_key(deletion.id)
-    return names.asset_record_key(AssetKind(deletion.what), deletion.id)
-
-
-def _keys_below(store: Store, folder: str) -> list[str]:
-    return sorted(entry.key for entry in store.list(folder))
+    return names.asset_key(AssetKind(deletion.what), deletion.id, "asset.json")
 
 
 def _record_last(keys: Iterable[str], record: str) -> list[str]:
@@ -264,8 +259,7 @@ class GarbageCollector:
             return True
         before = timestamp(self._services.settings.shard_grace_s)
         # The record of a deletion is deleted last.
-        removed = [entry.key for entry in self._services.store.list(names.REMOVED)]
-        for key in sorted(removed, key=lambda key: key.endswith("/deletion.json")):
+        for key in sorted(self._services.store.keys(names.REMOVED), key=lambda key: key.endswith("/deletion.json")):
             if self._clock() > deadline:
                 return True
             if records.is_removed_before(key, before):
@@ -289,11 +283,11 @@ class GarbageCollector:
         for asset in index.assets.refused(before=timestamp(REFUSED_S)):
             if self._clock() > deadline:
                 return True
-            record = names.asset_record_key(asset.kind, asset.digest)
+            record = names.asset_key(asset.kind, asset.digest, "asset.json")
             with index.database.write_transaction() as connection:
                 if index.removals.reason_to_keep_asset(asset, within=connection):
                     continue
-                for key in _record_last(_keys_below(store, record.rpartition("/")[0]), record):
+                for key in _record_last(store.keys(record.rpartition("/")[0]), record):
                     store.delete(key)
                 index.removals.remove_asset(asset.kind, asset.digest, within=connection)
             log.info("the refused %s %s is deleted", asset.kind.value, asset.name)
@@ -301,7 +295,7 @@ class GarbageCollector:
 
     def _read_records(self, model: type[RecordT], folder: str) -> Iterator[tuple[str, RecordT]]:
         """Yield key and content of the readable records below a folder, ordered by key."""
-        for key in sorted(entry.key for entry in self._services.store.list(folder)):
+        for key in self._services.store.keys(folder):
             try:
                 yield key, records.read_record(model, self._services.store, key)
             except DamagedError as error:

@@ -131,8 +131,7 @@ def check_service(store: Store, redis: str | None) -> bool:
 
 
 def service_ids(store: Store) -> list[str]:
-    keys = sorted(entry.key for entry in store.list(names.SERVICE))
-    return [read_record(ServiceRecord, store, key).id for key in keys]
+    return [read_record(ServiceRecord, store, key).id for key in store.keys(names.SERVICE)]
 
 
 def recorded_service(folder: Path | None) -> str | None:
@@ -151,4 +150,4 @@ def _foreign_index_error(store: str) -> str:
 
 
 def _add_service_record(store: Store, number: int, identity: str) -> None:
-    put_record(store, names.service_key(number), ServiceRecord(id=identity, at=timestamp()))
+    put_record(store, f"{names.SERVICE}/{number:06}.json", ServiceRecord(id=identity, at=timestamp()))

@@ -153,13 +153,8 @@ class Indexer:
         wait = 0.0 if at_once else backoff(self._services.settings.retry_backoff_s, attempt.number)
         state = self._services.index.write.add_attempt(attempt, not_before=time.time() + wait)
         if state is not None:
-            about = {
-                "job": attempt.job_id,
-                "task": attempt.task_id,
-                "attempt": attempt.number,
-                "worker": attempt.worker,
-            }
-            log.warning("attempt failed: %s: %s", attempt.kind, attempt.reason, extra=about)
+            said = {"job": attempt.job_id, "task": attempt.task_id, "attempt": attempt.number, "worker": attempt.worker}
+            log.warning("attempt failed: %s: %s", attempt.kind, attempt.reason, extra=said)
             self._tally.count_failure(attempt.stage.value, attempt.kind)
             self.publish_states({attempt.job_id: state})
 
@@ -184,9 +179,8 @@ class Indexer:
             # A check that ended without a result is repeated.
             self._defer(event)
         elif event.kind is EventKind.FAILED:
-            self.index_attempt(
-                read_record(AttemptRecord, self._services.store, attempt_key(event.task_id, event.attempt))
-            )
+            key = attempt_key(event.task_id, event.attempt)
+            self.index_attempt(read_record(AttemptRecord, self._services.store, key))
         else:
             self._tally.add("graspd_task_handbacks_total", event.stage or "", event.kind.value)
             if event.kind is EventKind.DEFERRED:

@@ -93,7 +93,6 @@ FOLDERS: Final = (
 )
 _SEALED: Final = (".json", ".zip", ".npz", ".glb")
 _SHARD: Final = re.compile(r"shards/(base|scene|views)/([0-9a-f]{32})\.(h5|json)")
-STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 MISSING: Final = "its file is missing"
 NO_MANIFEST: Final = "it has no manifest"
 BAD_MANIFEST: Final = "its manifest is damaged"
@@ -138,8 +137,8 @@ def examine(
             return Damage(key, FOREIGN) if store.exists(key) else None
         kind, shard, ending = match.groups()
         if ending == "json":
-            return _check_manifest(store, key, STAGES[kind], shard, read, unsealed)
-        manifest = names.shard_manifest_key(STAGES[kind], shard)
+            return _check_manifest(store, key, names.STAGES[kind], shard, read, unsealed)
+        manifest = names.shard_manifest_key(names.STAGES[kind], shard)
         # The manifest is written last, possibly between these calls.
         orphan = not store.exists(manifest) and store.exists(key) and not store.exists(manifest)
         return Damage(key, NO_MANIFEST, shard) if orphan else None
@@ -325,7 +324,7 @@ def _repair_object(services: Services, one: Damage, harmed: set[str]) -> str:
         return _repair_asset(services, one.key, AssetKind(match[1]), match[2], match[3])
     if not one.shard:
         return "put a copy in its place"
-    stage = STAGES[one.key.split("/")[1]]
+    stage = names.STAGES[one.key.split("/")[1]]
     if may_await_manifest(services.store, one):
         return "its manifest may follow soon; run the command again in a minute"
     planned = _task_of_shard(services, stage, one.shard)
@@ -356,7 +355,7 @@ def _repair_asset(services: Services, key: str, kind: AssetKind, digest: str, fi
     if is_builtin:
         publish_builtins(services.store)
     if file in ("model.glb", "check.json") and not services.store.exists(key):
-        services.store.set_aside(names.asset_check_key(kind, digest))
+        services.store.set_aside(names.asset_key(kind, digest, "check.json"))
         with contextlib.suppress(NotFoundError, DamagedError):
             services.index.write.add_asset(load_asset(services.store, kind, digest), None)
             services.index.live.set_asset_waiting([digest], queued=False)

@@ -110,7 +110,7 @@ class LeaseReaper:
         self._indexer.index_attempt(attempt)
 
     def _recover_check(self, kind: AssetKind, digest: str) -> None:
-        if self._services.store.exists(names.asset_check_key(kind, digest)):
+        if self._services.store.exists(names.asset_key(kind, digest, "check.json")):
             try:
                 self._indexer.index_asset(kind, digest)
             except DamagedError as error:
@@ -159,7 +159,7 @@ class LeaseReaper:
             ended = f"the check of this {message.kind.value} crashed its worker {message.attempt} times"
             reason = f"{ended}; delete it to try again"
             found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}
-            put_document(self._services.store, names.asset_check_key(message.kind, message.digest), found)
+            put_document(self._services.store, names.asset_key(message.kind, message.digest, "check.json"), found)
             self._indexer.index_asset(message.kind, message.digest)
         else:
             self._services.index.live.add_asset_attempt(message.digest, message.attempt, not_before=0.0)

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from redis import Redis
 from redis.exceptions import LockError, RedisError, ResponseError
@@ -31,6 +31,7 @@ from graspd.service.queue.connection import connect, redis_url
 from graspd.service.queue.port import MOST_LOG, Event, Lease, Message, Place, QueueStatus, rq_id
 from graspd.service.settings import Settings
 
+KindT = TypeVar("KindT")
 EVENTS: Final = "graspd:events"
 #: Maximum number of events (20 MB), enough for a minute without a controller at 400 tasks/s; the store restores others.
 EVENTS_KEPT: Final = 50_000
@@ -49,6 +50,25 @@ _WORKER: Final = b"graspd:worker:"
 _LOG: Final = "graspd:log:"
 
 
+@contextmanager
+def _convert_errors() -> Iterator[None]:
+    try:
+        yield
+    except (RedisError, OSError) as error:
+        raise QueueUnavailable(
+            f"Redis does not answer ({first_line(error)}); start `graspd up`, or set GRASPD_REDIS_URL"
+        ) from None
+
+
+def _converts_errors(kind: type[KindT]) -> type[KindT]:
+    """Decorate a class: the errors of Redis in its public methods become QueueUnavailable."""
+    for name, method in vars(kind).items():
+        if not name.startswith("_"):
+            setattr(kind, name, _convert_errors()(method))
+    return kind
+
+
+@_converts_errors
 class RqQueue:
     """Tasks and their leases, events, living workers, and sums.
 
@@ -65,8 +85,7 @@ class RqQueue:
     def ping(self) -> float:
         """Return the round-trip time [s]."""
         start = time.perf_counter()
-        with _convert_errors():
-            self.connection.ping()
+        self.connection.ping()
         return time.perf_counter() - start
 
     def enqueue(
@@ -80,22 +99,21 @@ class RqQueue:
         if again:
             stale += [entries.job_key(rq_id(message.task_id, message.attempt)) for message in messages]
         added = 0
-        with _convert_errors():
-            if stale:
-                self.connection.delete(*stale)
-            for message in messages:
-                name = entries.queue_name(priority, message.stage, requirements_of(message) if apart else None)
-                if name not in self._queues:
-                    self._queues[name] = Queue(name, self.connection, serializer=JSONSerializer)
-                with suppress(DuplicateJobError):
-                    self._queues[name].enqueue_job(self._job(message), unique=True)
-                    added += 1
+        if stale:
+            self.connection.delete(*stale)
+        for message in messages:
+            name = entries.queue_name(priority, message.stage, requirements_of(message) if apart else None)
+            if name not in self._queues:
+                self._queues[name] = Queue(name, self.connection, serializer=JSONSerializer)
+            with suppress(DuplicateJobError):
+                self._queues[name].enqueue_job(self._job(message), unique=True)
+                added += 1
         return added
 
     def discard(self, task_ids: Collection[str]) -> None:
         """Remove waiting tasks; ask workers that run one of them to stop at the next launch."""
         wanted = set(task_ids)
-        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+        with self.connection.pipeline(transaction=False) as pipe:
             for task in wanted:
                 pipe.set(cancel_key(task), "1", ex=_CANCEL_TTL_S)
             pipe.execute()
@@ -107,13 +125,13 @@ class RqQueue:
             pipe.execute()
 
     def waiting_tasks(self) -> set[str]:
-        with _convert_errors(), self.connection.pipeline(transaction=True) as pipe:
+        with self.connection.pipeline(transaction=True) as pipe:
             for key in self._list_keys():
                 pipe.lrange(key, 0, -1)
             return {entries.split_rq_id(entries.decode_text(job))[0] for jobs in pipe.execute() for job in jobs}
 
     def depths(self) -> dict[tuple[Priority, Stage], int]:
-        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+        with self.connection.pipeline(transaction=False) as pipe:
             lists = entries.list_names(self.connection)
             for name in lists:
                 pipe.llen(entries.list_key(name))
@@ -125,7 +143,7 @@ class RqQueue:
     def remove_unserved_lists(self, present: Collection[WorkerHeartbeat]) -> None:
         """Remove separate lists that no worker can serve; the controller queues their tasks again."""
         abilities = [(stage, beat.capabilities) for beat in present for stage in beat.stages]
-        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+        with self.connection.pipeline(transaction=False) as pipe:
             for name in entries.unserved_lists(entries.list_names(self.connection), abilities):
                 key = entries.list_key(name)
                 for job in self.connection.lrange(key, 0, -1):
@@ -139,7 +157,7 @@ class RqQueue:
     def leases(self) -> list[Lease]:
         """Return the leases of all workers, living or dead; reading changes nothing."""
         # RQ's own readers also move lost tasks and run callbacks, so the keys are read directly.
-        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+        with self.connection.pipeline(transaction=False) as pipe:
             keys = [entries.lease_registry_key(name) for name in entries.list_names(self.connection)]
             for key in keys:
                 pipe.zrange(key, 0, -1, withscores=True)
@@ -155,7 +173,7 @@ class RqQueue:
 
     def lease_holder(self, lease: Lease) -> tuple[str, Message | None]:
         """Return worker and message of a lost lease; "" or None if Redis has lost the data."""
-        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+        with self.connection.pipeline(transaction=False) as pipe:
             pipe.hmget(entries.job_key(entries.decode_text(lease.key[1].partition(b":")[0])), "worker_name", "data")
             (found,) = pipe.execute(raise_on_error=False)  # The name may have a value of another type.
         worker, data = (None, None) if isinstance(found, Exception) else found
@@ -165,105 +183,89 @@ class RqQueue:
         """Remove the lease of a lost worker; a worker that still lives detects the loss and stops."""
         key, entry = lease.key
         name = entries.decode_text(entry)
-        with _convert_errors(), self.connection.pipeline(transaction=True) as pipe:
+        with self.connection.pipeline(transaction=True) as pipe:
             pipe.zrem(key, entry)
             pipe.delete(*entries.execution_keys(name), entries.job_key(name.partition(":")[0]))
             pipe.execute()
 
     def workers(self) -> list[WorkerHeartbeat]:
         """Return the workers with a heartbeat within the last lease time."""
-        with _convert_errors():
-            names = sorted(self.connection.smembers(WORKERS))
-            found = self.connection.mget([_WORKER + name for name in names]) if names else []
+        names = sorted(self.connection.smembers(WORKERS))
+        found = self.connection.mget([_WORKER + name for name in names]) if names else []
         return [beat for data in found if (beat := entries.parse_entry(WorkerHeartbeat, data)) is not None]
 
     def publish(self, *events: Event) -> None:
-        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+        with self.connection.pipeline(transaction=False) as pipe:
             for event in events:
                 put_event(pipe, event)
             pipe.execute()
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Return the next events with their ids, oldest first, after those an earlier controller left."""
-        with _convert_errors():
-            while self._unread != ">":
-                pending = self._read_group(self._unread, limit, 0.0)
-                self._unread = pending[-1][0] if pending else ">"
-                if known := self._readable_events(pending):
-                    return known
-            return self._readable_events(self._read_group(">", limit, wait_s))
+        while self._unread != ">":
+            pending = self._read_group(self._unread, limit, 0.0)
+            self._unread = pending[-1][0] if pending else ">"
+            if known := self._readable_events(pending):
+                return known
+        return self._readable_events(self._read_group(">", limit, wait_s))
 
     def put_task_log(self, attempt: str, text: str) -> None:
         """Replace the log of an attempt, which has the id `rq_id(...)`."""
-        with _convert_errors():
-            self.connection.set(_LOG + attempt, text, ex=_LOG_TTL_S)
+        self.connection.set(_LOG + attempt, text, ex=_LOG_TTL_S)
 
     def task_log(self, attempt: str) -> str:
         """Return the log of an attempt that runs or ended recently; "" without one."""
-        with _convert_errors():
-            return entries.decode_text(self.connection.get(_LOG + attempt))[:MOST_LOG]
+        return entries.decode_text(self.connection.get(_LOG + attempt))[:MOST_LOG]
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         if event_ids:
-            with _convert_errors():
-                self.connection.xack(EVENTS, _GROUP, *event_ids)
-
-    def events_after(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Return the events after an id, for any number of readers; `"$"`: only future events, `"0"`: all."""
-        with _convert_errors():
-            found = self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
-        return [(event_id, event) for event_id, event in entries.parse_events(found) if event is not None]
+            self.connection.xack(EVENTS, _GROUP, *event_ids)
 
     def announce(self, part: str, seconds: float) -> None:
         """Register a part of the service (the controller) as running for some seconds."""
-        with _convert_errors():
-            self.connection.set(_part_key(part), "1", px=int(seconds * 1000))
+        self.connection.set(_part_key(part), "1", px=int(seconds * 1000))
 
     def is_announced(self, part: str) -> bool:
-        with _convert_errors():
-            return bool(self.connection.exists(_part_key(part)))
+        return bool(self.connection.exists(_part_key(part)))
 
     def service_id(self) -> str | None:
         """Return the identity of the service that owns this queue; None if unset, or lost by Redis."""
-        with _convert_errors():
-            found = self.connection.get(_SERVICE)
+        found = self.connection.get(_SERVICE)
         return None if found is None else entries.decode_text(found)
 
     def set_service_id(self, identity: str, *, instead: bool = False) -> None:
         """Set the identity of the owning service; an existing one is replaced only with `instead`."""
-        with _convert_errors():
-            self.connection.set(_SERVICE, identity, nx=not instead)
+        self.connection.set(_SERVICE, identity, nx=not instead)
 
     def renew_leadership(self, holder: str, seconds: float) -> bool:
         """Acquire or renew the controllers' leadership for some seconds; False if another controller leads."""
-        with _convert_errors():
-            new = self.connection.lock(LEAD, timeout=seconds, thread_local=False)
-            lease = self._leases.setdefault(holder, new)
-            lease.timeout = seconds
-            try:
-                if lease.owned():
-                    return bool(lease.reacquire())
-                self.resign(holder)  # Lease of an ended process of the same name.
-                if lease.acquire(blocking=False, token=holder):
-                    return True
-                if self.connection.ttl(LEAD) == -1:  # A key without expiry is not a lease.
-                    self.connection.delete(LEAD)
-            except LockError:
-                pass
-            except ResponseError as error:
-                if not entries.is_type_error(error):
-                    raise
+        new = self.connection.lock(LEAD, timeout=seconds, thread_local=False)
+        lease = self._leases.setdefault(holder, new)
+        lease.timeout = seconds
+        try:
+            if lease.owned():
+                return bool(lease.reacquire())
+            self.resign(holder)  # Lease of an ended process of the same name.
+            if lease.acquire(blocking=False, token=holder):
+                return True
+            if self.connection.ttl(LEAD) == -1:  # A key without expiry is not a lease.
                 self.connection.delete(LEAD)
-            return False
+        except LockError:
+            pass
+        except ResponseError as error:
+            if not entries.is_type_error(error):
+                raise
+            self.connection.delete(LEAD)
+        return False
 
     def resign(self, holder: str) -> None:
-        with _convert_errors(), suppress(LockError):
+        with suppress(LockError):
             self.connection.lock(LEAD).do_release(holder)
 
     def status(self, *, lease_s: float) -> QueueStatus:
         """Return queue lengths, ages [s] and workers for the metrics, in constant time per list."""
         beats = self.workers()
-        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+        with self.connection.pipeline(transaction=False) as pipe:
             lists = entries.list_names(self.connection)
             for name in lists:
                 pipe.llen(entries.list_key(name))
@@ -290,14 +292,13 @@ class RqQueue:
         return QueueStatus(depth, oldest, running, workers)
 
     def add_to_counters(self, amounts: Mapping[str, float]) -> None:
-        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+        with self.connection.pipeline(transaction=False) as pipe:
             for name, amount in amounts.items():
                 pipe.hincrbyfloat(METRICS, name, amount)
             pipe.execute()
 
     def counter_sums(self) -> dict[str, float]:
-        with _convert_errors():
-            found = self.connection.hgetall(METRICS)
+        found = self.connection.hgetall(METRICS)
         sums: dict[str, float] = {}
         for name, raw in found.items():
             with suppress(ValueError):
@@ -306,7 +307,7 @@ class RqQueue:
 
     def remove_stale_keys(self) -> None:
         """Remove keys of wrong types, and the registrations of dead workers, which RQ leaves."""
-        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+        with self.connection.pipeline(transaction=False) as pipe:
             lists = entries.list_names(self.connection)
             entries.remove_mistyped_keys(self.connection, {**_KINDS, **entries.key_types(lists)}, EVENTS)
             known = list(self.connection.smembers(WORKERS))
@@ -414,13 +415,3 @@ _KINDS: Final = {
     EVENTS: "stream",
     METRICS: "hash",
 }
-
-
-@contextmanager
-def _convert_errors() -> Iterator[None]:
-    try:
-        yield
-    except (RedisError, OSError) as error:
-        raise QueueUnavailable(
-            f"Redis does not answer ({first_line(error)}); start `graspd up`, or set GRASPD_REDIS_URL"
-        ) from None

@@ -185,13 +185,7 @@ NOISES: Final[Mapping[str, DepthNoise]] = MappingProxyType(
         # steps of 1/32 px (subpixel linearity), 126 px searched (nearest 17 cm: issue 999), 99 % filled (data sheet).
         # Handa et al. shift by half a pixel.
         "stereo": DepthNoise(
-            424.0,
-            0.05,
-            disparity_px=0.08,
-            disparity_step_px=1 / 32,
-            lateral_px=0.5,
-            most_disparity_px=126.0,
-            dropout=0.01,
+            424, 0.05, disparity_px=0.08, disparity_step_px=1 / 32, lateral_px=0.5, most_disparity_px=126, dropout=0.01
         ),
         # Kinect v1: f = 585 px, 75 mm, steps of 1/8 px (Khoshelham); noise of Nguyen, eq. 2 and 4, lateral eq. 1.
         "structured_light": DepthNoise(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 from collections.abc import Iterable, Iterator
@@ -16,7 +15,7 @@ from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
 from graspd.service.model.planning import plan_tasks
 from graspd.service.model.records import JobRecord
 from graspd.service.store.columns import ShardKind
-from graspd.service.store.integrity import check_content, check_digest, check_file, missing_error
+from graspd.service.store.integrity import check_content, check_file, checked_chunks, missing_error
 from graspd.service.store.manifests import load_manifest
 from graspd.service.store.packs import PACKED, has_packs
 from graspd.service.store.records import newest_snapshot, read_record
@@ -25,7 +24,6 @@ from graspd.service.store.store import Store, open_store
 from graspd.service.user_cache import cache_folder, evict, write_atomically
 
 DEFAULT_BYTES: Final = 20 << 30
-_STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 
 
 @dataclass(frozen=True)
@@ -78,14 +76,10 @@ class ShardCache:
         if os.getpid() != self._process and not store.url.startswith(("file:", "memory:")):
             fix = "start new processes: DataLoader(..., multiprocessing_context='spawn')"
             raise InputError(f"{store.url} cannot be read in a fork of the process that opened it; {fix}")
-        digest = hashlib.sha256()
         try:
-            for chunk in store.stream(key):
-                digest.update(chunk)
-                yield chunk
+            yield from checked_chunks(f"{store.url}/{key}", store.stream(key), sha256)
         except NotFoundError:
             raise missing_error(f"{store.url}/{key}") from None
-        check_digest(f"{store.url}/{key}", digest.hexdigest(), sha256)
 
 
 @dataclass(frozen=True)
@@ -212,5 +206,5 @@ def _shards_of_snapshot(store: Store, dataset: str, digest: str | None) -> Itera
 
 
 def _sort_files(files: Iterable[ShardFile]) -> tuple[ShardFile, ...]:
-    order = list(_STAGES)
+    order = list(names.STAGES)
     return tuple(sorted(files, key=lambda file: (file.hand, file.object, file.batch, order.index(file.kind), file.id)))

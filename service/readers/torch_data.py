@@ -21,7 +21,7 @@ from torch.utils.data import Dataset, IterableDataset, default_collate, get_work
 
 from graspd.service.readers.clouds import OF_GRASPS
 from graspd.service.readers.files import Shards
-from graspd.service.readers.grasps import DEFAULT_COLUMNS, Grasps, Where
+from graspd.service.readers.grasps import DEFAULT_COLUMNS, Grasps
 
 Sample = dict[str, Any]
 
@@ -65,30 +65,26 @@ class ShuffledShards(IterableDataset[Sample]):
         shards: Shards,
         columns: Sequence[str] = DEFAULT_COLUMNS,
         *,
-        valid: bool = True,
-        unvalidated: bool = False,
-        where: Where | None = None,
         buffer: int = 4096,
         seed: int = 0,
         rank: int = 0,
         ranks: int = 1,
         transform: Callable[[Sample], Sample] = to_tensors,
+        **selection: Any,
     ) -> None:
         """Args:
         shards: see `open_shards`.
         columns: columns of a sample.
-        valid: select only valid grasps.
-        unvalidated: select instead only feasible grasps without validation.
-        where: function of the columns that returns a mask, for further selection.
         buffer: number of grasps from which the next one is drawn.
         seed: seed of the order; `epoch` changes it.
         rank, ranks: rank of this process, and number of processes of a distributed run.
         transform: maps a sample of arrays to the value that the loader collates.
+        selection: `valid`, `unvalidated` and `where` of `Grasps`.
         """
         self.epoch = 0
         self._shards, self._columns, self._transform = shards, tuple(columns), transform
-        self._selection: dict[str, Any] = {"valid": valid, "unvalidated": unvalidated, "where": where}
-        self._buffer, self._seed, self._rank, self._ranks = max(1, buffer), seed, rank, ranks
+        self._selection, self._buffer = selection, max(1, buffer)
+        self._seed, self._rank, self._ranks = seed, rank, ranks
 
     def __iter__(self) -> Iterator[Sample]:
         worker = get_worker_info()

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Mapping
 from functools import reduce
-from operator import and_, eq, ge, gt, le, lt, ne, or_
+from operator import and_, or_
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.service.model import where as expressions
 from graspd.service.model.metrics import GRASP_METRICS, GraspMetric
 from graspd.service.model.where import Connective, Flag, MetricComparison, Negation, Node, TypeComparison, parse_where
 from graspd.service.store import validity
@@ -19,12 +20,7 @@ Mask = NDArray[np.bool_]
 Test = Callable[[Mapping[str, Array], Mapping[str, Any]], Mask]
 
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS}
-_OPERATORS: Final = {"<": lt, "<=": le, ">": gt, ">=": ge, "=": eq, "!=": ne}
-_STATUSES: Final = {
-    "valid": validity.valid_mask,
-    "feasible": validity.feasible_mask,
-    "validated": validity.validated_mask,
-}
+_MASKS: Final = {"valid": validity.valid_mask, "feasible": validity.feasible_mask, "validated": validity.validated_mask}
 #: Columns of flags, which are true where the column is 1.
 _FLAGS: Final = {"held": "quality/success", "lift": "quality/lift_outcome", "lift_hard": "quality/lift_hard"}
 
@@ -44,7 +40,7 @@ def _evaluate(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any])
         return ~_evaluate(node.part, columns, said)
     if isinstance(node, Flag):
         return _status_mask(node.name, columns)
-    compare = _OPERATORS[node.op]
+    compare = expressions.OPERATORS[node.op]
     if isinstance(node, MetricComparison):
         values = metric_values(_METRICS[node.name], columns)
         with np.errstate(invalid="ignore"):
@@ -56,8 +52,8 @@ def _evaluate(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any])
 
 
 def _status_mask(name: str, columns: Mapping[str, Array]) -> Mask:
-    if name in _STATUSES:
-        return _STATUSES[name](columns)
+    if name in _MASKS:
+        return _MASKS[name](columns)
     path = _FLAGS[name]
     return np.asarray(columns[path]) == 1 if path in columns else np.zeros(len(columns["quality/valid"]), bool)
 

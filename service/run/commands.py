@@ -49,8 +49,7 @@ def up(
     from graspd.service.run.supervisor import Supervisor
 
     settings = cli.load_settings(host=host, port=port, device=device, data_dir=data_dir)
-    cli.log_to_stderr(settings, "up")
-    cli.restrict_file_access(settings)
+    cli.set_up_process(settings, "up")
     stop = stop_on_signals()
     console = cli.plain_console(stderr=True)
     others = new_listen_address(settings, share, host=share_host, port=redis_port) if share is not None else None
@@ -75,8 +74,7 @@ def controller(
 ) -> None:
     """Run a controller (retries, index), which leads or stands by. `graspd up` starts one."""
     settings = cli.load_settings(data_dir=data_dir)
-    cli.log_to_stderr(settings, "controller")
-    cli.restrict_file_access(settings)
+    cli.set_up_process(settings, "controller")
     if check:
         from graspd.service.pipeline.leading import PART
         from graspd.service.queue.rq_queue import open_queue
@@ -183,9 +181,8 @@ def export(
 
     with closing(Index(cli.load_settings(data_dir=data_dir).resolved_index_url)) as index:
         rows = write(index.database, output)
-    cli.print_result(
-        rows, "\n".join(f"{output / name}.parquet  {count} rows" for name, count in rows.items()), json=json
-    )
+    lines = [f"{output / name}.parquet  {count} rows" for name, count in rows.items()]
+    cli.print_result(rows, "\n".join(lines), json=json)
 
 
 @index_app.command(epilog="graspd admin index path")

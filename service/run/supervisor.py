@@ -123,9 +123,7 @@ class Supervisor:
                     starts = {**self._start_counts(), "redis": starts.get("redis", 0)}
                 now = time.monotonic()
                 patience = min(timeout, _REDIS_S) if "redis" in missing and self._wanted.redis_url else timeout
-                if again := [
-                    name for name, count in self._start_counts().items() if count - starts.get(name, 0) >= _ENDS
-                ]:
+                if again := [name for name, n in self._start_counts().items() if n - starts.get(name, 0) >= _ENDS]:
                     raise UnavailableError(f"{', '.join(again)} ended {_ENDS} times before getting ready; see {logs}")
                 if now - began > patience or self._stopping.is_set():
                     raise UnavailableError(f"not ready after {now - began:.0f} s: {', '.join(missing)}; see {logs}")

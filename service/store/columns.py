@@ -181,12 +181,7 @@ class RootAttribute:
     kinds: tuple[str, ...] = ("base", "scene", "views")
 
 
-_TYPES: Final[Mapping[str, tuple[type, ...]]] = {
-    "text": (str,),
-    "integer": (int,),
-    "number": (int, float),
-    "texts": (list,),
-}
+_TYPES: Final[dict[str, Any]] = {"text": str, "integer": int, "number": int | float, "texts": list}
 _BASE: Final = ("base",)
 
 ATTRIBUTES: Final[dict[str, RootAttribute]] = {

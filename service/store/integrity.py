@@ -49,6 +49,15 @@ def check_digest(name: str, found: str, expected: str) -> None:
         raise DamagedShard(f"{name} is damaged: its SHA-256 is {found[:12]}..., expected {expected[:12]}...; {FIX}")
 
 
+def checked_chunks(name: str, chunks: Iterable[bytes], expected: str) -> Iterator[bytes]:
+    """Yield chunks; DamagedShard after the last one unless they have the expected SHA-256."""
+    digest = hashlib.sha256()
+    for chunk in chunks:
+        digest.update(chunk)
+        yield chunk
+    check_digest(name, digest.hexdigest(), expected)
+
+
 def missing_error(key: str) -> DamagedShard:
     return DamagedShard(f"{key} is missing in the store, although its manifest exists; {FIX}")
 

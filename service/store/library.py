@@ -40,7 +40,7 @@ def store_files(
     with tempfile.TemporaryFile() as archive:
         pack_into(files, archive)
         seal_archive(archive)
-        key = names.asset_files_key(kind, asset.digest)
+        key = names.asset_key(kind, asset.digest, "files.zip")
         if not store.put_file(key, archive) and _is_damaged(store, key):
             store.set_aside(key)
             store.put_file(key, archive)
@@ -57,7 +57,7 @@ def _is_damaged(store: Store, key: str) -> bool:
 
 def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
     """Write the record, by `put` if given; ConflictError for known content with another name or deletion."""
-    record = names.asset_record_key(asset.kind, asset.digest)
+    record = names.asset_key(asset.kind, asset.digest, "asset.json")
     is_new = put(record, asset) if put is not None else put_record(store, record, asset)
     if store.exists(names.deletion_key(asset.kind.value, asset.digest)):
         if is_new:
@@ -84,7 +84,7 @@ def publish_builtins(store: Store) -> list[Asset]:
             published.append(publish_asset(store, kind, name, files, {"builtin": True, "created": asset.created}))
         except DamagedError as error:
             log.warning("the built-in %s %s cannot be used: %s", kind.value, name, error)
-        key = names.asset_model_key(kind, asset.digest)
+        key = names.asset_key(kind, asset.digest, "model.glb")
         model = add_seal(key, builtin_model(kind, name))
         # The model depends on code and asset: a model of an older version is replaced.
         if not store.put(key, model) and store.get(key) != model:
@@ -102,12 +102,12 @@ def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:
 
 
 def load_asset(store: Store, kind: AssetKind, digest: str) -> Asset:
-    return read_record(Asset, store, names.asset_record_key(kind, digest))
+    return read_record(Asset, store, names.asset_key(kind, digest, "asset.json"))
 
 
 def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, bytes]:
     """Load all files of a hand or object; InputError if they do not match the digest."""
-    files = unpack(store.get(names.asset_files_key(kind, digest)), limit_bytes=UNPACKED_LIMIT_BYTES)
+    files = unpack(store.get(names.asset_key(kind, digest, "files.zip")), limit_bytes=UNPACKED_LIMIT_BYTES)
     if digest_files(kind, files) != digest:
         raise InputError(f"the archive of {kind.value} {digest} in the store is damaged; upload it again")
     return files
@@ -115,7 +115,7 @@ def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, by
 
 def load_check(store: Store, kind: AssetKind, digest: str) -> dict[str, object] | None:
     """Load the report of ingest (`verdict`, `message`, `repairs`, `facts`); None before its end."""
-    key = names.asset_check_key(kind, digest)
+    key = names.asset_key(kind, digest, "check.json")
     if not store.exists(key):
         return None
     with contextlib.suppress(DamagedError):

@@ -77,14 +77,6 @@ class ShardManifest(Record):
     grasps: tuple[GraspSummary, ...] = ()
     info: dict[str, Any] = Field(default_factory=dict)
 
-    @model_validator(mode="before")
-    @classmethod
-    def _set_candidates(cls, data: Any) -> Any:
-        # Shards of early versions contain all candidates.
-        if isinstance(data, dict) and "candidates" not in data and data.get("kind") == "base":
-            return {**data, "candidates": data.get("counts", {}).get("N", 0)}
-        return data
-
     @model_validator(mode="after")
     def _check_summaries(self) -> ShardManifest:
         if self.stage is Stage.SYNTHESIZE and len(self.grasps) != self.counts.get("N"):
@@ -206,9 +198,8 @@ def rebuild_manifest(said: Mapping[str, Any], data: bytes) -> ShardManifest:
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
     shard = read_shard(data, without=pictures, name=said["key"])
     file = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}
-    return ShardManifest.model_validate(
-        {**said, **file, **_content_fields(said["kind"], shard.arrays, shard.attributes)}
-    )
+    content = _content_fields(said["kind"], shard.arrays, shard.attributes)
+    return ShardManifest.model_validate({**said, **file, **content})
 
 
 def _decode_verdict(value: int) -> bool | None:

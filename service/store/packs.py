@@ -53,7 +53,7 @@ def convert_packs(store: Store) -> Iterator[ShardManifest]:
     An interrupted call can be repeated. Damaged packs move to `damaged/`. The manifest of a damaged file is stored,
     so that its replacement must match the checksum.
     """
-    keys = sorted(entry.key for entry in store.list(_FOLDER))
+    keys = store.keys(_FOLDER)
     packs = [key for key in keys if key.endswith(".pack")]
     for pack in packs:
         dead = pack.removesuffix(".pack") + ".dead/"

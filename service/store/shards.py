@@ -53,16 +53,11 @@ def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attrib
         for path, array in arrays.items():
             column = SCHEMAS[kind][path]
             data = np.ascontiguousarray(array, dtype=column.dtype)
-            options: dict[str, Any] = {}
+            layout: dict[str, Any] = {}
             if data.ndim >= 3 and data.nbytes > 65536:
                 # One chunk per picture, so that readers unpack single pictures; shuffled bytes compress better.
-                options = {
-                    "compression": "gzip",
-                    "compression_opts": 1,
-                    "shuffle": True,
-                    "chunks": (1, *data.shape[1:]),
-                }
-            dataset = file.create_dataset(path, data=data, track_times=False, **options)
+                layout = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "chunks": (1, *data.shape[1:])}
+            dataset = file.create_dataset(path, data=data, track_times=False, **layout)
             for name in ("units", "frame", "description"):
                 dataset.attrs[name] = getattr(column, name)
             dataset.attrs[_DIGEST] = _array_digest(data)

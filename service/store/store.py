@@ -10,7 +10,7 @@ import random
 import re
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
@@ -122,6 +122,9 @@ class Store:
         with _convert_errors(prefix, self.url):
             for batch in obstore.list(self._backend, check_key(prefix), offset=offset):
                 yield from (Entry(str(meta["path"]), int(meta["size"])) for meta in batch)
+
+    def keys(self, prefix: str) -> Sequence[str]:
+        return sorted(entry.key for entry in self.list(prefix))
 
     def sign(self, key: str, *, seconds: int = 3600) -> str | None:
         """Return a temporary URL for reading the object without credentials; None if unsupported."""

@@ -53,7 +53,7 @@ def contents_of(data: Path):
     return contents_of_store(open_store(f"file://{data / 'store'}", make=False), NAME, cache=data / "cache")
 
 
-def no_progress(step: str, done: int, total: int) -> None:
+def no_progress(done: float, total: float, step: str) -> None:
     pass
 
 

@@ -12,6 +12,7 @@ import trimesh
 
 from benchmarks.integrators import descents, flights, gradients, hands, scenes
 from benchmarks.integrators.__main__ import MAPS, measure
+from benchmarks.integrators.grades import grade
 from benchmarks.integrators.hands import Coupling, ring_hand
 from benchmarks.integrators.model_errors import ERRORS, model_error_map
 from graspd.commands.studies import STUDIES
@@ -21,7 +22,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.metrics import PerturbedParameter
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.service.model.studies import MapCell, Stability, StabilityMap, grade, parse_stability
+from graspd.service.model.studies import MapCell, Stability, StabilityMap, parse_stability
 from graspd.service.store.records import latest_record
 from graspd.service.store.store import open_store
 from graspd.studies.stability import shapes

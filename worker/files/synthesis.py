@@ -76,15 +76,10 @@ class SynthesisResult:
         if self.interrupted:
             return f"interrupted: {count} of {request.grasps} grasps were finished"
         limit, narrow = self.payload_limit, self.narrow_reason
-        reason = explain_shortfall(
-            count,
-            request.grasps,
-            request.counted_status,
-            sum(batch.candidates for batch in self.batches),
-            request.budget,
-            sum_outcomes(batch.outcomes for batch in self.batches),
-            limit.line if limit is not None and limit.is_far_exceeded else "",
-        )
+        candidates = sum(batch.candidates for batch in self.batches)
+        outcomes = sum_outcomes(batch.outcomes for batch in self.batches)
+        exceeded = limit.line if limit is not None and limit.is_far_exceeded else ""
+        reason = explain_shortfall(request, count, candidates, outcomes, limit=exceeded)
         if limit is not None and not limit.is_far_exceeded:
             reason = f"{reason}; {limit.line}"
         return f"{reason}; {narrow}" if reason and narrow else reason

@@ -123,7 +123,7 @@ class Runner:
 
     def _is_done(self, message: Message, context: TaskContext) -> bool:
         if isinstance(message, messages.IngestMessage):
-            return context.store.exists(names.asset_check_key(message.kind, message.digest))
+            return context.store.exists(names.asset_key(message.kind, message.digest, "check.json"))
         file = names.shard_file_key(message.stage, message.output)
         return shard_exists(context.store, message.stage, message.output) and context.store.exists(file)
 

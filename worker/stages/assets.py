@@ -69,7 +69,7 @@ def object_of(store: Store, message: TaskMessage | ShardManifest) -> ObjectModel
         if obj.parts is None and any(text and not parse_region(text).planes for text in regions):
             # Objects that were stored by earlier versions have no parts.
             obj = _load(store, digest, name=name, face_error_m=error)
-        if not store.exists(names.asset_model_key(AssetKind.OBJECT, digest)):
+        if not store.exists(names.asset_key(AssetKind.OBJECT, digest, "model.glb")):
             # The model does not depend on which fidelity comes first.
             shown = prepared_object(store, digest, name=name, face_error_m=SHOWN_ERROR_M)
             publish_model(store, AssetKind.OBJECT, shown)
@@ -126,7 +126,7 @@ def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float
     Raises MeshError: the mesh cannot be used. StoreUnavailable."""
     # A change of a prepared mesh changes its grasps, and with them the revision of their stage.
     terms = {"face_error_m": face_error_m, "revision": STAGE_REVISIONS["synthesize"]}
-    key = names.prepared_object_key(digest, digest_json(terms))
+    key = names.asset_key(AssetKind.OBJECT, digest, f"prepared/{digest_json(terms)}.npz")
     try:
         return prepare.from_bytes(get_sealed(store, key), name=name, digest=digest)
     except NotFoundError:
@@ -151,7 +151,7 @@ def load_pieces(store: Store, obj: ObjectModel) -> ConvexPieces:
     """Return an object's pieces from this machine's cache or the store, else compute and store them.
     Raises MeshError: the object has no usable pieces. StoreUnavailable."""
     file = piece_file(obj)
-    key = names.object_pieces_key(obj.digest, file.stem)
+    key = names.asset_key(AssetKind.OBJECT, obj.digest, f"pieces/{file.stem}.npz")
     with _pieces_lock:  # tasks of one object start at once: one of them makes the pieces
         if not file.is_file():
             _fetch_pieces(store, key, file)
@@ -184,7 +184,7 @@ def load_hand_files(store: Store, digest: str) -> dict[str, bytes]:
     main = main_file(files, settings)
     if format_of(main, files[main]) != "xacro":
         return files
-    key = names.expanded_hand_key(digest)
+    key = names.asset_key(AssetKind.HAND, digest, "expanded.json")
     if not store.exists(key):
         put_document(store, key, {"urdf": expand_xacro(files, main, settings.xacro).decode()})
     return {**files, main: str(get_document(store, key)["urdf"]).encode()}

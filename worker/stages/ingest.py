@@ -49,8 +49,8 @@ def run(message: IngestMessage, context: TaskContext) -> None:
         load = partial(load_hand, files, name=message.name, digest=message.digest)
         found["facts"]["self_test"] = self_test_facts(load, context.run)
     if model:
-        put_sealed(context.store, names.asset_model_key(message.kind, message.digest), model)
-    put_document(context.store, names.asset_check_key(message.kind, message.digest), found)
+        put_sealed(context.store, names.asset_key(message.kind, message.digest, "model.glb"), model)
+    put_document(context.store, names.asset_key(message.kind, message.digest, "check.json"), found)
 
 
 def _load_files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:

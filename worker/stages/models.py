@@ -44,7 +44,7 @@ def model_glb(kind: AssetKind, name: str, files: dict[str, bytes]) -> bytes:
 
 def publish_model(store: Store, kind: AssetKind, model: HandModel | ObjectModel) -> None:
     """Store the glTF of a loaded hand or object unless it exists."""
-    key = names.asset_model_key(kind, model.digest)
+    key = names.asset_key(kind, model.digest, "model.glb")
     if not store.exists(key):
         put_sealed(store, key, hand_glb(model) if isinstance(model, HandModel) else object_glb(model))
 

@@ -56,9 +56,7 @@ _LONGEST_TEXT: Final = 2000
 
 
 def job_row(record: JobRecord) -> Row:
-    plain = ("id", "hand_digest", "object_digest", "owner", "project", "span", "created")
-    return {
-        **{name: getattr(record, name) for name in plain},
+    others = {
         "state": State.QUEUED.value,
         "priority": record.priority.value,
         "hand": record.request.hand,
@@ -73,6 +71,7 @@ def job_row(record: JobRecord) -> Row:
         "choice": record.choice and record.choice.model_dump(),
         "network_digest": record.request.network,
     }
+    return row_from(jobs, record, **others)
 
 
 def neighbour_digests(options: JobOptions) -> str:
@@ -121,14 +120,9 @@ def row_from(table: Table, record: object, **others: Any) -> Row:
 
 
 def shard_row(manifest: ShardManifest) -> Row:
-    plain = [column.name for column in shards.columns if column.name not in ("id", "charged", "manifest")]
-    return {
-        **{name: getattr(manifest, name) for name in plain},
-        "id": manifest.shard_id,
-        "stage": manifest.stage.value,
-        "inputs": list(manifest.inputs),
-        "manifest": manifest.model_dump(mode="json", exclude={"grasps": True, "info": {"log"}}),
-    }
+    content = manifest.model_dump(mode="json", exclude={"grasps": True, "info": {"log"}})
+    others = {"id": manifest.shard_id, "stage": manifest.stage.value, "inputs": list(manifest.inputs)}
+    return row_from(shards, manifest, charged="", manifest=content, **others)
 
 
 def grasp_rows(manifest: ShardManifest) -> list[Row]:
@@ -146,9 +140,7 @@ def grasp_rows(manifest: ShardManifest) -> list[Row]:
 def asset_row(asset: Asset, check: Mapping[str, Any] | None) -> Row:
     """Return the row of a hand, object or network; a built-in asset counts as accepted without a check."""
     found = check or ({"verdict": "accept"} if asset.builtin else {})
-    plain = ("digest", "name", "filename", "size_bytes", "created", "builtin", "owner", "project", "shared")
-    return {
-        **{name: getattr(asset, name) for name in plain},
+    others = {
         "kind": asset.kind.value,
         "files": list(asset.files),
         "verdict": found.get("verdict"),
@@ -159,6 +151,7 @@ def asset_row(asset: Asset, check: Mapping[str, Any] | None) -> Row:
         "queued": False,
         "not_before": 0.0,
     }
+    return row_from(assets, asset, **others)
 
 
 def _limited_facts(facts: dict[str, Any]) -> dict[str, Any]:

@@ -52,17 +52,11 @@ class Datasets(IndexPart):
         query = select(datasets).where(datasets.c.name.in_(sorted(names)))
         with self.database.read_transaction() as connection:
             rows = connection.execute(query).mappings().all()
-            return {
-                row["name"] for row in rows if not _dataset_state(row, _cell_counts_by_state(connection, row)).is_final
-            }
+            return {row["name"] for row in rows if not _has_ended(connection, row)}
 
     def ended_event_counts(self, *, within: Connection) -> dict[str, int]:
         rows = self.database.rows(select(datasets), within)
-        return {
-            row["name"]: row["events"]
-            for row in rows
-            if _dataset_state(row, _cell_counts_by_state(within, row)).is_final
-        }
+        return {row["name"]: row["events"] for row in rows if _has_ended(within, row)}
 
     def cells(
         self,
@@ -160,6 +154,10 @@ def _dataset_state(row: Any, states: dict[State, int]) -> State:
     return State.QUEUED if state.is_final and row["applied"] < row["events"] else state
 
 
+def _has_ended(connection: Connection, row: Any) -> bool:
+    return _dataset_state(row, _cell_counts_by_state(connection, row)).is_final
+
+
 def _cell_counts_by_state(connection: Connection, row: Any) -> dict[State, int]:
     now = _cell_state(row["cancelled"])
     query = select(now, func.count()).select_from(dataset_cells).where(dataset_cells.c.dataset == row["name"])
@@ -215,9 +213,7 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
         reason = row["reason"]
         if row["state"] == State.SUCCEEDED.value and options.want == "valid" and found < options.grasps:
             rejected, candidates = outcomes_of(connection, tasks.c.job_id == job), yields.get("candidates", 0)
-            reason = explain_shortfall(
-                found, options.grasps, options.counted_status, candidates, options.budget, rejected
-            )
+            reason = explain_shortfall(options, found, candidates, rejected)
         views.append(
             CellView(
                 **{name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "choice")},

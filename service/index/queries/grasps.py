@@ -21,6 +21,7 @@ from sqlalchemy.sql.operators import in_op, is_
 from graspd.service.index import database
 from graspd.service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
 from graspd.service.index.views import GraspView, Page
+from graspd.service.model import where as expressions
 from graspd.service.model.base import Model
 from graspd.service.model.errors import InputError
 from graspd.service.model.metric_fields import SortedName
@@ -91,14 +92,6 @@ LOOKED_AT: Final = (1000, 20_000)
 #: Columns by name, of the table of grasps or of a subquery.
 Columns = Any
 _METRICS: Final = frozenset(metric.name for metric in indexed_metrics())
-_OPERATORS: Final[dict[str, Callable[[Any, Any], ColumnElement[bool]]]] = {
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-    "=": operator.eq,
-    "!=": operator.ne,
-}
 _FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
     "validated": lambda grasps: grasps.success.is_not(None),
     "valid": lambda grasps: grasps.valid.is_(True),
@@ -339,11 +332,16 @@ def sql_condition(node: Node, grasps: Columns) -> ColumnElement[bool]:
         return _comparison(grasps[node.name], node.op, node.bound)
     if isinstance(node, TypeComparison):
         return _comparison(grasps.grasp_type, node.op, int(node.kind))
-    return _OPERATORS[node.op](grasps[node.name], node.word)
+    return _compare(grasps[node.name], node.op, node.word)
 
 
 def _comparison(column: Any, op: str, value: float) -> ColumnElement[bool]:
-    return and_(column.is_not(None), _OPERATORS[op](column, value))
+    return and_(column.is_not(None), _compare(column, op, value))
+
+
+def _compare(column: Any, op: str, value: Any) -> ColumnElement[bool]:
+    test: ColumnElement[bool] = expressions.OPERATORS[op](column, value)
+    return test
 
 
 def _missing_column_error(name: str) -> InputError:

@@ -217,9 +217,8 @@ class Shards(database.IndexPart):
 
     def job_of(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> str | None:
         """Return a job in scope that requested this shard; None if the index has none."""
-        query = select(tasks.c.job_id).where(
-            tasks.c.shard_id == shard_id, *database.scope_conditions_by_job(scope, tasks)
-        )
+        in_scope = database.scope_conditions_by_job(scope, tasks)
+        query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *in_scope)
         found: str | None = self.database.value(query.limit(1))
         return found
 

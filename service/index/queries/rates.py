@@ -76,12 +76,7 @@ ORIGIN: Final = "stored default: 2 CPU cores, docs/explanation/scaling.md"
 STORED: Final[dict[str, tuple[float, float]]] = {"draft": (0.13, 0.7), "standard": (0.16, 0.7), "fine": (0.24, 0.7)}
 #: The same of other methods at their published budget: time and success of the planner (docs/results/chart.md), plus
 #: postures, metrics and validation.
-STORED_METHODS: Final[dict[str, tuple[float, float]]] = {
-    "graspit": (1.5, 0.2),
-    "graspd2022": (0.75, 0.4),
-    "dfc": (0.3, 0.44),
-    "autograsp": (0.13, 0.36),
-}
+STORED_OTHER: Final = {"graspit": (1.5, 0.2), "graspd2022": (0.75, 0.4), "dfc": (0.3, 0.44), "autograsp": (0.13, 0.36)}
 _BYTES_PER_GRASP: Final = 1338.0
 STORED_SCENE: Final = StageRate(0.5, 240.0, ORIGIN, 0)
 #: Cost of a scene in which grasps are planned; `STORED_SCENE` applies to transfers of existing grasps.
@@ -154,19 +149,16 @@ def _stored_rates(options: JobOptions) -> tuple[float, float, str]:
     if options.model_count:
         plain = options.model_copy(update={"robust": 0.0, "robust_models": 0})
         seconds, share, origin = _stored_rates(plain)
-        return (
-            seconds + share * options.model_count * STORED_MODEL_S,
-            share,
-            f"{origin}, and {options.model_count} models",
-        )
+        longer = seconds + share * options.model_count * STORED_MODEL_S
+        return longer, share, f"{origin}, and {options.model_count} models"
     if options.in_scene:
         free = {"scene": "free", "faces": "drawn", "touch": TOUCH, "neighbours": ()}
         seconds, _, origin = _stored_rates(options.model_copy(update=free))
         longer, share = STORED_IN_SCENE
         return longer * seconds, share, f"{origin}, in a scene"
     method, name = options.method, options.resolved_fidelity.name
-    if method in STORED_METHODS:
-        return *STORED_METHODS[method], f"{ORIGIN}, {method}"
+    if method in STORED_OTHER:
+        return *STORED_OTHER[method], f"{ORIGIN}, {method}"
     origin = ORIGIN if name in STORED else f"{ORIGIN}, value of standard (none for {name})"
     if method != "fast_graspd":
         origin = f"{ORIGIN}, value of fast_graspd (none for {method})"
@@ -189,7 +181,7 @@ def measure_machine(batches: Iterable[BatchCost]) -> Machine:
 def _has_stored_rate(request: JobOptions) -> bool:
     if request.options or request.in_scene or request.model_count:
         return False
-    return request.method in STORED_METHODS or (
+    return request.method in STORED_OTHER or (
         request.method == "fast_graspd" and request.resolved_fidelity.name in STORED
     )
 

@@ -201,10 +201,7 @@ def _rates_used(sums: _Sums) -> list[RateUsed]:
             hand=hand,
             cells=cells,
             seconds_per_valid=rate.seconds_per_try / rate.valid_yield if rate.valid_yield else None,
-            seconds_per_try=rate.seconds_per_try,
-            valid_yield=rate.valid_yield,
-            origin=rate.origin,
-            batches=rate.batches,
+            **{name: getattr(rate, name) for name in ("seconds_per_try", "valid_yield", "origin", "batches")},
         )
         for (hand, rate), cells in ordered[:_SHOWN_RATES]
     ]

@@ -5,9 +5,10 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
+from graspd.service.cli import write_output
 from graspd.service.model.errors import InputError
 from graspd.service.model.records import Snapshot, SnapshotShard
-from graspd.service.store.integrity import CHECKSUMS, check_digest
+from graspd.service.store.integrity import CHECKSUMS, checked_chunks
 
 #: Function that yields the bytes of a shard in chunks, from the API or from the store.
 Fetch = Callable[[SnapshotShard], Iterable[bytes]]
@@ -27,7 +28,7 @@ def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Prog
         path = folder / path_of(shard)
         if not _is_exported(path, shard):
             _make_folder(path.parent)
-            _fetch(shard, path, fetch)
+            write_output(path, checked_chunks(f"shard {shard.id}", fetch(shard), shard.sha256))
             fetched, size = fetched + 1, size + shard.size_bytes
         if progress is not None:
             progress(number, len(snapshot.shards), size)
@@ -53,18 +54,3 @@ def _is_exported(path: Path, shard: SnapshotShard) -> bool:
         return False
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest() == shard.sha256
-
-
-def _fetch(shard: SnapshotShard, path: Path, fetch: Fetch) -> None:
-    """Fetch a shard to a temporary file, which gets its final name if its checksum matches."""
-    draft = path.with_name(f".{path.name}.part")
-    digest = hashlib.sha256()
-    try:
-        with draft.open("wb") as file:
-            for chunk in fetch(shard):
-                digest.update(chunk)
-                file.write(chunk)
-        check_digest(f"shard {shard.id}", digest.hexdigest(), shard.sha256)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)

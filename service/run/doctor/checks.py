@@ -1,14 +1,15 @@
 """Checks of an installation, with fixes. Each check has a timeout, so that a hang hides no others."""
 
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
 from graspd.service.model.errors import GraspdError
 
+#: Prefix of the names of threads, of which one that hangs would delay the end of the process.
 THREADS: Final = "doctor-"
 
 
@@ -44,33 +45,25 @@ class Check:
 def run_checks(checks: Sequence[Check]) -> Iterator[Finding]:
     """Run all checks at once; yield findings in the order of the checks, each as early as possible."""
     started = time.monotonic()
-    runs = [_CheckRun(check) for check in checks]
-    for run in runs:
-        yield run.finding(started + run.check.limit_s)
-
-
-class _CheckRun:
-    """Check in a daemon thread, which does not delay the end of the process."""
-
-    def __init__(self, check: Check) -> None:
-        self.check = check
-        self._finding: Finding | None = None
-        self._thread = threading.Thread(target=self._run, name=f"{THREADS}{check.name}", daemon=True)
-        self._thread.start()
-
-    def finding(self, deadline: float) -> Finding:
-        self._thread.join(max(0.0, deadline - time.monotonic()))
-        hangs = bad(f"no answer within {self.check.limit_s:.0f} s", self.check.mend_hang)
-        return replace(self._finding or hangs, name=self.check.name)
-
-    def _run(self) -> None:
+    pool = ThreadPoolExecutor(max(1, len(checks)), thread_name_prefix=THREADS)
+    runs = [pool.submit(_finding_of, check) for check in checks]
+    pool.shutdown(wait=False)
+    for check, run in zip(checks, runs, strict=True):
         try:
-            self._finding = self.check.look()
-        except GraspdError as error:
-            self._finding = bad(str(error), "see the message")
-        except Exception as error:
-            line = " ".join(f"{type(error).__name__}: {error}".split())[:300]
-            self._finding = bad(f"the check itself failed: {line}", "report it to the authors of graspd")
+            found = run.result(max(0.0, started + check.limit_s - time.monotonic()))
+        except TimeoutError:
+            found = bad(f"no answer within {check.limit_s:.0f} s", check.mend_hang)
+        yield replace(found, name=check.name)
+
+
+def _finding_of(check: Check) -> Finding:
+    try:
+        return check.look()
+    except GraspdError as error:
+        return bad(str(error), "see the message")
+    except Exception as error:
+        line = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+        return bad(f"the check itself failed: {line}", "report it to the authors of graspd")
 
 
 def good(message: str) -> Finding:

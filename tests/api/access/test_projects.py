@@ -279,7 +279,7 @@ def test_what_is_shared_is_used_by_all_and_deleted_by_its_own(world: World) -> N
 
 def test_an_upload_with_the_mark_of_a_project_is_not_its_own(world: World) -> None:
     made = world.services.index.assets.get(AssetKind.OBJECT, world.said["objects_digest"])
-    stored = world.services.store.get(names.asset_files_key(AssetKind.OBJECT, made.digest))
+    stored = world.services.store.get(names.asset_key(AssetKind.OBJECT, made.digest, "files.zip"))
     with zipfile.ZipFile(io.BytesIO(stored)) as archive:
         assert "graspd-project.txt" in archive.namelist()
     for said in ({}, {"shared": "true"}):

@@ -100,7 +100,7 @@ def test_progress_shows_messages_as_they_are(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(type(console), "is_terminal", True)
     display = JobDisplay(console)
     progress: Progress = display._progress
-    progress.add_task("render", total=1, message="[red]mug[/] [/nothing]", scale=1, unit="batches")
+    progress.add_task("render", total=1, message="[red]mug[/] [/nothing]", rate="")
     with console.capture() as got:
         console.print(progress)
     assert "[red]mug[/] [/nothing]" in got.get()

@@ -30,7 +30,7 @@ def no_wait(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def check(services: Services, asset: AssetView, verdict: str, facts: Any = None) -> None:
     found = {"verdict": verdict, "message": "a thing of 60 m", "repairs": [], "facts": facts or {}}
-    services.store.put(names.asset_check_key(AssetKind.OBJECT, asset.digest), json.dumps(found).encode())
+    services.store.put(names.asset_key(AssetKind.OBJECT, asset.digest, "check.json"), json.dumps(found).encode())
     services.index.write.add_asset(load_asset(services.store, AssetKind.OBJECT, asset.digest), found)
 
 

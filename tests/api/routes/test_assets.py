@@ -405,8 +405,12 @@ def test_an_unknown_hand_or_one_without_a_model_is_not_found(http: TestClient) -
 def test_a_model_of_an_older_version_says_the_mend(http: TestClient, services: Services) -> None:
     made = http.post("/v1/hands", files={"file": ("old.urdf", b"<robot/>")}).json()
     mug = http.get("/v1/objects/mug").json()["digest"]
-    for model in (b"glTF", b"glTF" + bytes(40), services.store.get(names.asset_model_key(AssetKind.OBJECT, mug))):
-        key = names.asset_model_key(AssetKind.HAND, made["digest"])
+    for model in (
+        b"glTF",
+        b"glTF" + bytes(40),
+        services.store.get(names.asset_key(AssetKind.OBJECT, mug, "model.glb")),
+    ):
+        key = names.asset_key(AssetKind.HAND, made["digest"], "model.glb")
         services.store.delete(key)
         services.store.put(key, model)
         answer = corrected(http, SAID, hand="old")
@@ -418,7 +422,7 @@ def test_damaged_files_or_a_long_description_are_refused(http: TestClient, servi
     monkeypatch.setattr("graspd.api.catalog.assets.MAX_BYTES", 100)
     answer = corrected(http, SAID)
     assert answer.status_code == 413 and "give fewer corrections" in answer.json()["detail"]
-    key = names.asset_files_key(AssetKind.HAND, http.get("/v1/hands/barrett").json()["digest"])
+    key = names.asset_key(AssetKind.HAND, http.get("/v1/hands/barrett").json()["digest"], "files.zip")
     overwrite(services.store, key, zipped({"other.urdf": b"<robot/>"}))
     answer = corrected(http, SAID)
     assert answer.status_code == 500 and "upload it again" in answer.json()["detail"]

@@ -71,7 +71,7 @@ def attempt_of(services: Services) -> str:
 
 def event_of(services: Services) -> str:
     event = add_job_event(services.store, a_job(services), "cancelled")
-    return names.event_key(names.job_events_folder(a_job(services)), event.number, "cancelled")
+    return f"{names.job_events_folder(a_job(services))}/{event.number:06}-cancelled.json"
 
 
 def ball(services: Services) -> tuple[AssetKind, str]:
@@ -86,8 +86,8 @@ RECORDS: dict[str, Callable[[Services], str]] = {
     ),
     "attempt": attempt_of,
     "event": event_of,
-    "asset": lambda services: names.asset_record_key(*ball(services)),
-    "check": lambda services: names.asset_check_key(*ball(services)),
+    "asset": lambda services: names.asset_key(*ball(services), "asset.json"),
+    "check": lambda services: names.asset_key(*ball(services), "check.json"),
     "dataset": lambda services: names.dataset_record_key("kitchen"),
     "snapshot": lambda services: names.dataset_snapshot_key("kitchen", "a" * 32),
 }

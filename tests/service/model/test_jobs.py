@@ -305,20 +305,19 @@ def test_the_wait_doubles_up_to_a_bound() -> None:
 
 
 def test_why_fewer_grasps_were_found_is_told_the_most_frequent_first() -> None:
-    assert explain_shortfall(8, 8, "valid", 12, 4, {"slipped": 4}) is None
+    assert explain_shortfall(request(grasps=8, budget=4), 8, 12, {"slipped": 4}) is None
     lost = sum_outcomes([{"slipped": 4, "no_place": 1}, {"slipped": 1, "turned": 2, "alike": 0, "fell_apart": 3}])
     assert lost == {"no_place": 1, "turned": 2, "slipped": 5, "fell_apart": 3}
-    said = str(explain_shortfall(0, 2, "valid", 8, 4, lost))
+    said = str(explain_shortfall(request(grasps=2, budget=4), 0, 8, lost))
     known = {name: f"{count} {OUTCOMES.get(name)}" for name, count in lost.items()}
     counts = f"{known['slipped']}, 3 fell apart, {known['turned']}, {known['no_place']}"
     assert said.startswith(f"found 0 of 2 valid grasps in 8 candidates: {counts}; the budget of 4 candidates")
-    said = str(explain_shortfall(1, 4, "valid", 7, 4, {"not_lifted": 6, "repeated": 9}))
+    said = str(explain_shortfall(request(grasps=4, budget=4), 1, 7, {"not_lifted": 6, "repeated": 9}))
     assert said.startswith("found 1 of 4 valid grasps in 16 candidates: 9 repeated attempts, 6 not lifted; the budget")
 
 
 def test_a_limit_of_the_hand_stands_where_the_budget_would() -> None:
     limit = planning.payload_limit_text("barrett", 0.6, 16, 5.66, math.inf, 100.0)
     assert limit == "barrett lifts 5.7 kg at friction 0.6 in the best of 16 grasps; 100 kg are wanted"
-    assert (
-        str(explain_shortfall(0, 4, "valid", 4, 4, {}, limit)) == f"found 0 of 4 valid grasps in 4 candidates; {limit}"
-    )
+    said = str(explain_shortfall(request(grasps=4), 0, 4, {}, limit=limit))
+    assert said == f"found 0 of 4 valid grasps in 4 candidates; {limit}"

@@ -27,7 +27,7 @@ from graspd.worker.process.runner import Runner
 from graspd.worker.stages.context import StopReason, TaskContext
 from tests.fakes import HAND_FILES, fake_stages, request, with_settings
 from tests.indexes import empty_index
-from tests.memory_queue import Delivery, MemoryQueue
+from tests.memory_queue import Delivery, MemoryQueue, events_after
 from tests.waiting import Clock, until
 
 
@@ -107,7 +107,7 @@ def test_a_job_goes_through_all_its_stages_and_tells_listeners(bench: Bench) -> 
     done = bench.services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 70)
     assert differences(bench.services.index, bench.services.store) == []
-    told = [e for _, e in bench.queue.events_after("0", limit=99, wait_s=0)]
+    told = [e for _, e in events_after(bench.queue)]
     assert [e.message for e in told if e.kind is EventKind.JOB] == ["queued", "running", "succeeded"]
     assert {e.job_id for e in told if e.kind is EventKind.JOB} == {job.id}
 
@@ -308,7 +308,7 @@ def test_an_upload_is_checked_and_what_was_found_is_indexed(bench: Bench) -> Non
 
     def check(message: IngestMessage, context: TaskContext) -> None:
         found = {"verdict": "repair", "message": "one hole closed", "repairs": ["hole"], "facts": {"faces": 12}}
-        context.store.put(names.asset_check_key(message.kind, message.digest), json.dumps(found).encode())
+        context.store.put(names.asset_key(message.kind, message.digest, "check.json"), json.dumps(found).encode())
 
     bench.work_off(ingest=check)
     view = bench.services.index.assets.get(AssetKind.HAND, "upload")
@@ -342,7 +342,7 @@ def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> 
 
 def test_files_below_an_asset_do_not_stop_a_controller(bench: Bench) -> None:
     (digest, *_) = [digest for kind, digest in stored_assets(bench.services.store) if kind is AssetKind.OBJECT]
-    bench.services.store.put(names.object_pieces_key(digest, "32"), b"pieces")
+    bench.services.store.put(names.asset_key(AssetKind.OBJECT, digest, "pieces/32.npz"), b"pieces")
     bench.controller.run_round()
     assert differences(bench.services.index, bench.services.store) == []
 

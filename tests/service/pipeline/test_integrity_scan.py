@@ -83,10 +83,10 @@ def full(services: Services) -> Services:
     gone = Deletion(what="job", id="b" * 32, at=timestamp())
     put_record(store, f"{removed_folder(gone)}/deletion.json", gone)
     put_record(store, f"{removed_folder(gone)}/{names.job_record_key(gone.id)}", record)
-    put_record(store, names.service_key(1), ServiceRecord(id="c" * 32, at=timestamp()))
+    put_record(store, f"{names.SERVICE}/000001.json", ServiceRecord(id="c" * 32, at=timestamp()))
     put_document(store, names.mark_key("d" * 32), {"at": timestamp()})
     hand = services.index.assets.get(AssetKind.HAND, "gripper").digest
-    put_document(store, names.expanded_hand_key(hand), {"urdf": "<robot name='claw'/>"})
+    put_document(store, names.asset_key(AssetKind.HAND, hand, "expanded.json"), {"urdf": "<robot name='claw'/>"})
     hook = Webhook(id="f" * 32, url="https://example.org/", states=("succeeded",), created=timestamp())
     put_record(store, names.webhook_key(hook.id), hook)
     tag = Tag(id="a" * 32, name="good", number=1, created=timestamp(), changed=timestamp())
@@ -97,8 +97,8 @@ def full(services: Services) -> Services:
     ball = services.index.assets.get(AssetKind.OBJECT, "ball").digest
     file = io.BytesIO()
     np.savez(file, vertices=np.arange(30.0))
-    put_sealed(store, names.prepared_object_key(ball, "1" * 32), file.getvalue())
-    put_sealed(store, names.object_pieces_key(ball, "2" * 32), file.getvalue())
+    put_sealed(store, names.asset_key(AssetKind.OBJECT, ball, f"prepared/{'1' * 32}.npz"), file.getvalue())
+    put_sealed(store, names.asset_key(AssetKind.OBJECT, ball, f"pieces/{'2' * 32}.npz"), file.getvalue())
     return services
 
 
@@ -138,7 +138,7 @@ def test_what_an_earlier_graspd_wrote_is_read_and_counted(services: Services) ->
     found = ObjectSet(name="c" * 64, digest="a" * 32, objects=("ball",), created=timestamp())
     key, without = names.object_set_key(found.name, found.digest), list[str]()
     services.store.put(key, found.model_dump_json().encode())
-    zipped = names.asset_files_key(AssetKind.OBJECT, services.index.assets.get(AssetKind.OBJECT, "ball").digest)
+    zipped = names.asset_key(AssetKind.OBJECT, services.index.assets.get(AssetKind.OBJECT, "ball").digest, "files.zip")
     overwrite(services.store, zipped, pack_files(OBJECT_FILES))
     assert read_record(ObjectSet, services.store, key) == found
     assert [wrong for _, wrong in scan(services.store, unsealed=without.append) if wrong is not None] == []
@@ -146,7 +146,7 @@ def test_what_an_earlier_graspd_wrote_is_read_and_counted(services: Services) ->
 
 
 def test_files_of_an_upload_replace_damaged_ones_and_match_their_name(services: Services) -> None:
-    key = names.asset_files_key(AssetKind.HAND, services.index.assets.get(AssetKind.HAND, "gripper").digest)
+    key = names.asset_key(AssetKind.HAND, services.index.assets.get(AssetKind.HAND, "gripper").digest, "files.zip")
     overwrite(services.store, key, flipped(services.store.get(key)))
     store_files(services.store, AssetKind.HAND, "gripper", HAND_FILES)
     assert examine(services.store, key) is None
@@ -158,7 +158,7 @@ def test_files_of_an_upload_replace_damaged_ones_and_match_their_name(services: 
 @pytest.mark.parametrize("file", ["model.glb", "check.json"])
 def test_what_a_check_found_is_made_again(services: Services, file: str) -> None:
     ball = services.index.assets.get(AssetKind.OBJECT, "ball").digest
-    folder = names.asset_check_key(AssetKind.OBJECT, ball).rpartition("/")[0]
+    folder = names.asset_key(AssetKind.OBJECT, ball, "check.json").rpartition("/")[0]
     put_document(services.store, f"{folder}/check.json", {"verdict": "accept"})
     put_sealed(services.store, f"{folder}/model.glb", b"glTF" + bytes(8) + b"\4\0\0\0JSON{}  ")
     overwrite(services.store, f"{folder}/{file}", flipped(services.store.get(f"{folder}/{file}")))
@@ -173,7 +173,7 @@ def test_what_a_check_found_is_made_again(services: Services, file: str) -> None
 def test_what_comes_with_graspd_is_put_again(services: Services) -> None:
     publish_builtins(services.store)
     mug = next(asset for asset in builtin_assets() if asset.kind is AssetKind.OBJECT)
-    folder = names.asset_record_key(mug.kind, mug.digest).rpartition("/")[0]
+    folder = names.asset_key(mug.kind, mug.digest, "asset.json").rpartition("/")[0]
     for file in ("asset.json", "files.zip", "model.glb"):
         overwrite(services.store, f"{folder}/{file}", flipped(services.store.get(f"{folder}/{file}")))
     _, left = repair(services, [wrong for _, wrong in scan(services.store) if wrong is not None])

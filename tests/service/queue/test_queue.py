@@ -216,16 +216,6 @@ def test_events_come_once_in_order_and_again_if_not_acknowledged(queue: RqQueue)
     assert [event.task_id for _, event in restarted.consume(limit=9, wait_s=0)] == ["b", "c"]
 
 
-def test_any_number_of_readers_follow_the_stream(queue: RqQueue) -> None:
-    queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id="j", message="queued"))
-    ((first_id, first),) = queue.events_after("0", limit=9, wait_s=0)
-    assert first.message == "queued"
-    assert queue.events_after(first_id, limit=9, wait_s=0) == []
-    queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id="j", message="running"))
-    assert [event.message for _, event in queue.events_after(first_id, limit=9, wait_s=0)] == ["running"]
-    assert len(queue.events_after("0", limit=9, wait_s=0)) == 2
-
-
 def test_a_part_is_there_as_long_as_it_says_so(queue: RqQueue) -> None:
     assert not queue.is_announced("controller")
     queue.announce("controller", 600)

@@ -18,7 +18,7 @@ from pydantic import SecretStr, ValidationError
 from typer.testing import CliRunner
 
 from graspd import cli as program
-from graspd.service.cli import EngineSettings, engine_settings, load_settings, report_errors
+from graspd.service.cli import load_settings, report_errors
 from graspd.service.model.errors import InputError, StoreUnavailable, UnavailableError
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.leading import PART
@@ -26,7 +26,6 @@ from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.run.commands import app
 from graspd.service.run.supervisor import _SETTLED, Supervisor, _explicit_settings
 from graspd.service.settings import Settings
-from tests.conftest import REPOSITORY
 from tests.fakes import request
 from tests.service.conftest import service
 
@@ -178,10 +177,10 @@ def test_a_service_keeps_its_data_from_other_users(tmp_path: Path) -> None:
     folder.chmod(0o755)
     environment = os.environ | {"GRASPD_DATA_DIR": str(folder), "GRASPD_REDIS_URL": f"unix://{tmp_path}/none.sock"}
     program = (
-        "from graspd.service.cli import restrict_file_access, load_settings\n"
+        "from graspd.service.cli import load_settings, set_up_process\n"
         "from graspd.service.pipeline.backends import Services\n"
         "settings = load_settings()\n"
-        "restrict_file_access(settings)\n"
+        "set_up_process(settings, 'up')\n"
         "services = Services.open(settings)\n"
         "services.store.put('jobs/a/job.json', b'1')\n"
         "services.close()\n"
@@ -190,12 +189,6 @@ def test_a_service_keeps_its_data_from_other_users(tmp_path: Path) -> None:
     modes = {path: stat.S_IMODE(path.stat().st_mode) for path in (folder, *folder.rglob("*"))}
     assert {path: oct(mode) for path, mode in modes.items() if mode & 0o077} == {}
     assert modes[folder] == 0o700
-
-
-@pytest.mark.parametrize("room", ["api/server_command.py", "service/run/commands.py", "graspd/commands/worker.py"])
-def test_every_service_command_is_private(room: str) -> None:
-    text = (REPOSITORY / room).read_text()
-    assert text.count('log_to_stderr(settings, "') == text.count("restrict_file_access(settings)") > 0
 
 
 #: Values of each setting that its default is none of; texts hold what shells, JSON and URLs give a meaning.
@@ -258,13 +251,9 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
 
 
 def test_defaults_count_until_a_value_is_set_and_a_bad_one_is_refused(bare: pytest.MonkeyPatch) -> None:
-    whole = load_settings()
-    assert engine_settings() == EngineSettings(whole.prefilter, whole.processes)
-    code = "import sys; from graspd.service.cli import engine_settings; engine_settings(); print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "pydantic_settings" not in done.stdout.split()
+    assert load_settings().processes == 0
     bare.setenv("graspd_processes", "3")
-    assert engine_settings() == EngineSettings("auto", 3)
+    assert load_settings().processes == 3
     bare.setenv("GRASPD_PREFILTER", "perhaps")
     with pytest.raises(InputError, match="GRASPD_PREFILTER"):
-        engine_settings()
+        load_settings()

@@ -260,7 +260,7 @@ def test_a_model_is_published_once(tmp_path) -> None:
     store = open_store(tmp_path.as_uri())
     obj = object_from_path("block")
     publish_model(store, AssetKind.OBJECT, obj)
-    key = names.asset_model_key(AssetKind.OBJECT, obj.digest)
+    key = names.asset_key(AssetKind.OBJECT, obj.digest, "model.glb")
     assert store.get(key)[:4] == b"glTF"
     publish_model(store, AssetKind.OBJECT, obj)
     assert store.get(key) == add_seal(key, object_glb(obj))

@@ -37,6 +37,7 @@ from graspd.worker.process.runner import Runner
 from graspd.worker.process.task_log import LINE_CHARACTERS, LINES
 from graspd.worker.stages.context import StopReason, TaskContext
 from tests.fakes import beat_of, engine_of, fake_synthesize, message_for
+from tests.memory_queue import events_after
 from tests.waiting import until
 from tests.worker.pool import works
 from tests.worker.process.test_runner import broken
@@ -59,7 +60,7 @@ class Worker:
         return int(child)
 
     def events(self) -> list[EventKind]:
-        return [event.kind for _, event in self.queue.events_after("0", limit=100, wait_s=0)]
+        return [event.kind for _, event in events_after(self.queue)]
 
     def states(self) -> list[str]:
         return [beat.state for beat in self.queue.workers()]
@@ -266,7 +267,7 @@ def test_what_a_worker_is_at_is_shown_at_once(heart: Heartbeat, rq_queue: RqQueu
 def test_a_worker_that_leaves_is_not_lost(heart: Heartbeat, rq_queue: RqQueue) -> None:
     heart.stop()
     assert rq_queue.workers() == []
-    assert [event.kind for _, event in rq_queue.events_after("0", limit=10, wait_s=0)] == [EventKind.LEFT]
+    assert [event.kind for _, event in events_after(rq_queue)] == [EventKind.LEFT]
 
 
 def test_it_goes_on_when_redis_answers_again(heart: Heartbeat, rq_queue: RqQueue) -> None:
@@ -290,7 +291,7 @@ def work(rq_queue, redis_server: str, tmp_path):
 
 @pytest.fixture
 def kinds(rq_queue):
-    return lambda: [event.kind for _, event in rq_queue.events_after("0", limit=100, wait_s=0)]
+    return lambda: [event.kind for _, event in events_after(rq_queue)]
 
 
 def _waits(redis: Any, entry: str | bytes) -> None:
@@ -399,7 +400,7 @@ def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue, work, kinds)
         rq_queue.connection.config_set("min-replicas-to-write", replicas)
 
     def stage(message: TaskMessage, context: TaskContext):
-        until(lambda: rq_queue.events_after("0", limit=1, wait_s=0), "it was told that the task began")
+        until(lambda: events_after(rq_queue), "it was told that the task began")
         refuse(1)
         threading.Timer(1.0, refuse, [0]).start()
         return fake_synthesize(message, context)

@@ -78,7 +78,7 @@ def run(store: Store, context: TaskContext, files: dict[str, bytes], kind: Asset
     asset = publish_asset(store, kind, "upload", files)
     message = IngestMessage(schema_=1, task_id="i", kind=kind, name="upload", digest=asset.digest)
     ingest.run(message, context)
-    found: dict[str, object] = json.loads(store.get(names.asset_check_key(kind, asset.digest)))
+    found: dict[str, object] = json.loads(store.get(names.asset_key(kind, asset.digest, "check.json")))
     return found
 
 
@@ -96,7 +96,7 @@ def test_a_hand_is_tried_if_its_record_says_so(context: TaskContext, monkeypatch
         asset = store_files(context.store, AssetKind.HAND, name, own, said={"self_test": True})
         record_asset(context.store, asset)
         ingest.run(IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name=name, digest=asset.digest), context)
-        found = json.loads(context.store.get(names.asset_check_key(AssetKind.HAND, asset.digest)))
+        found = json.loads(context.store.get(names.asset_key(AssetKind.HAND, asset.digest, "check.json")))
         return found["verdict"], found["facts"]["self_test"]["says"]
 
     monkeypatch.setattr(hand_self_test, "self_test", stand_in)
@@ -202,7 +202,7 @@ def upload(store: Store, kind: AssetKind, filename: str, data: bytes, options: d
     runner = Runner({Stage.INGEST: ingest.run}, worker="w", publish=lambda event: None)
     outcome = runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(store))
     assert outcome.kind is EventKind.FINISHED, outcome
-    return json.loads(store.get(names.asset_check_key(kind, asset.digest)))
+    return json.loads(store.get(names.asset_key(kind, asset.digest, "check.json")))
 
 
 def bad_files(shared_data: Path) -> list[dict[str, str]]:

@@ -183,7 +183,7 @@ def test_neighbours_in_a_bin_stand_in_scenes_grasps_and_pictures(table: Bench) -
     assert base["scene/neighbour_pose"].shape == (1, 2, 7)
     np.testing.assert_array_equal(base["scene/neighbour_pose"], first["scene/neighbour_pose"])
     assert len(scenes_of_shard(base).neighbours) == 2
-    assert table.store.exists(names.asset_model_key(AssetKind.OBJECT, beside[0]["digest"])), "viewers show it"
+    assert table.store.exists(names.asset_key(AssetKind.OBJECT, beside[0]["digest"], "model.glb")), "viewers show it"
     alone = render_alone(bench, base)
     assert (views["image/depth"] != alone["image/depth"]).any(), "they are in the picture"
     assert set(np.unique(views["image/segmentation"])) - {0, 1, 2}
@@ -384,7 +384,7 @@ def test_the_grasps_of_a_job_are_those_of_synth_with_the_file(store: Store, netw
 
 
 def test_files_that_are_not_what_their_digest_says_fail_the_job(store: Store, network: Asset, files) -> None:
-    key = names.asset_files_key(AssetKind.NETWORK, network.digest)
+    key = names.asset_key(AssetKind.NETWORK, network.digest, "files.zip")
     store.delete(key)
     store.put(key, pack(files | {NETWORK_FILE: files[NETWORK_FILE][:-1]}))
     for digest, told in ((network.digest, f"network {network.digest} in the store is damaged"), ("e" * 32, "e" * 32)):
@@ -406,7 +406,7 @@ def test_a_network_whose_finding_was_lost_is_checked_by_a_worker(store: Store, n
     ingest.run(message, TaskContext(store))
     found = load_check(store, AssetKind.NETWORK, network.digest)
     assert found == json.loads(json.dumps(check_network(files, "net")))
-    assert not store.exists(names.asset_model_key(AssetKind.NETWORK, network.digest))
+    assert not store.exists(names.asset_key(AssetKind.NETWORK, network.digest, "model.glb"))
 
 
 @pytest.mark.parametrize(

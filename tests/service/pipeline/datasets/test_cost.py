@@ -8,8 +8,8 @@ from graspd.service.index.queries.overview import BatchCost
 from graspd.service.index.queries.rates import (
     ORIGIN,
     STORED,
-    STORED_METHODS,
     STORED_MODEL_S,
+    STORED_OTHER,
     STORED_PLACE,
     measure_machine,
 )
@@ -99,7 +99,7 @@ def test_one_measured_fidelity_scales_the_stored_rates_of_all(services: Services
     for changes, stored in (
         ({"fidelity": "draft"}, STORED["draft"]),
         ({"fidelity": "fine"}, STORED["fine"]),
-        ({"method": "graspit"}, STORED_METHODS["graspit"]),
+        ({"method": "graspit"}, STORED_OTHER["graspit"]),
     ):
         (rate,) = {rate.seconds_per_try for rate in estimate(services.index, wanted(**changes)).rates}
         assert rate == pytest.approx(factor * stored[0])
@@ -137,7 +137,7 @@ def test_batches_that_differ_widen_the_interval() -> None:
     [
         ({"fidelity": {"starts": 3}}, "value of standard (none for custom)", STORED["standard"]),
         ({"method": "mine"}, "value of fast_graspd (none for mine)", STORED["standard"]),
-        ({"method": "graspit"}, "graspit", STORED_METHODS["graspit"]),
+        ({"method": "graspit"}, "graspit", STORED_OTHER["graspit"]),
     ],
 )
 def test_what_nobody_measured_says_what_stands_in(services: Services, changes: Any, words: str, stored: Any) -> None:
