@@ -294,16 +294,6 @@ def with_section(page: str, section: str) -> str:
     return "\n## ".join([first, *parts, section.removeprefix("## ")]).replace("\n\n\n", "\n\n")
 
 
-#: Kinds of losses, by the names of pushes and of lifts.
-_KINDS: Final = {"rotated": "turned", "turned": "turned", "displaced": "dropped", "not lifted": "dropped"}
-
-
-def loss_kind(reason: str) -> str:
-    """Return `turned`, `dropped`, or another reason without the direction of the push."""
-    name = reason.partition(" under ")[0]
-    return _KINDS.get(name, name)
-
-
 def cause_lines(engines: tuple[str, ...], found: Found) -> list[str]:
     """Return the classes of grasps that one engine holds and another loses, with the changes that end the difference.
     All grasps: the same change among the grasps on which both engines agree."""
