@@ -48,7 +48,7 @@ def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
 
 
 class BenchExport:
-    """Export of grasps of many shards, and of all files that DexGraspBench's evaluator needs, below a folder."""
+    """Export of many shards' grasps with all files that DexGraspBench's evaluator needs."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._hands = folder, dict[str, list[HandMapping]]()

@@ -104,7 +104,7 @@ def write(
 
 
 def table_configs(tables: Sequence[str], splits: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the `configs` of a dataset card: tables `TABLE/SPLIT-*.parquet`, the first one as the default."""
+    """Return the `configs` of a dataset card: `TABLE/SPLIT-*.parquet`; the first table is the default."""
     return [
         {
             "config_name": table,

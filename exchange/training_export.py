@@ -56,7 +56,7 @@ def export_training(source: str, format_: str, wishes: TrainingExportOptions, fo
 
 
 def export_bench(source: str, wishes: TrainingExportOptions, split: str, folder: Path) -> ExportSummary:
-    """Write grasps in DexGraspBench's layout, shard by shard; those of a split (`train`, `test`) or, for "", all.
+    """Write grasps of a split (`train`, `test`; "": all) in DexGraspBench's layout, shard by shard.
     Raises InputError like `export_training`, or the split is empty."""
     from graspd.exchange.dexgraspbench import BenchExport
 

@@ -26,7 +26,7 @@ Found = dict[tuple[str, ...], list[list[EngineVerdicts]]]
 
 
 def plan_candidates(hand: str, obj: str, scene: str, count: int, seed: int, file: Path, *, threads: int = 0) -> Path:
-    """Write candidates that no validation selected to a file, unless it exists. Raises the errors of the planner."""
+    """Write unselected candidates to a file, unless it exists. Raises the planner's errors."""
     if not file.exists():
         request = JobOptions(grasps=count, seed=seed, want="candidates", validation="none", rechecks=0)
         made = synthesize_grasps(hand, obj, request, place=parse_scene(scene), threads=threads)
@@ -37,7 +37,7 @@ def plan_candidates(hand: str, obj: str, scene: str, count: int, seed: int, file
 def compare_frictions(
     case: Case, engines: Sequence[str], *, frictions: Sequence[str] = FRICTIONS, threads: int = 0
 ) -> dict[str, list[EngineVerdicts]]:
-    """Return verdicts at full and at half friction on the grasps of one file: pushes, or lifts out of scenes.
+    """Return verdicts on the grasps of one file at full and half friction: pushes, or lifts in scenes.
     Raises the errors of `compare_engines`."""
     given: dict[str, Any] = {} if case.placed is None else {"lift": True, "level": "lift"}
     given["run"] = ExecutionContext(threads=threads)
@@ -123,7 +123,7 @@ GROUPS: Final = ("hand", "scene", "friction")
 
 
 def matrix_lines(rows: Rows, heads: Sequence[str] = GROUPS) -> list[str]:
-    """Format summaries as Markdown: success and price, agreement of each pair, success in a held-back engine.
+    """Format summaries as Markdown: success, price, pairwise agreement, success in a held-back engine.
     `heads` are the headings of the keys."""
     engines = list(next(iter(rows.values()))["success"])
     lines = table(*heads, "n", *(f"{one} holds" for one in engines), *(f"{one} core-ms" for one in engines))

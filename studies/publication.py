@@ -1,4 +1,4 @@
-"""A dataset as a folder that dataset hubs take as it is: tables, tar files, card, Croissant file, checksums.
+"""Dataset as a folder for dataset hubs: tables, tar files, card, Croissant file, checksums.
 
 The folder is complete or absent: files are written below `.FOLDER.part`, each under a temporary name, and this folder
 is renamed at the end. A repeated call continues an interrupted one. One shard or picture at a time is in memory."""
@@ -63,7 +63,7 @@ class PublicationOptions:
 
 
 def publish(contents: Contents, folder: Path, options: PublicationOptions, progress: Progress, name: str = "") -> None:
-    """Write the folder, unless it is there already; its card tells readers to load `name`, by default the folder.
+    """Write the folder, unless it exists; its card tells readers to load `name`, by default the folder.
     Raises InputError: a licence is unknown, or pyarrow is missing. ConflictError: the folder has other content."""
     parquet.import_pyarrow()
     folder, unknown = folder.resolve(), _unknown_licences(contents, options)
@@ -136,7 +136,7 @@ def _read_record(folder: Path, asked: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _test_objects(contents: Contents, share: float) -> frozenset[str]:
-    """Return the objects of the held-out families, by one base shard of each object; none if the share is 0."""
+    """Return the objects of held-out families, from one base shard of each; none if the share is 0."""
     known = {}
     firsts = {file.object: file for file in reversed(contents.shards.of_kind("base"))} if share else {}
     for name, file in firsts.items():
@@ -224,7 +224,7 @@ class Hub:
     """A dataset repository of Hugging Face's hub, or of a server with its API at HF_ENDPOINT."""
 
     def __init__(self, repository: str) -> None:
-        """Raises InputError: no such name, huggingface_hub is missing, or UnavailableError: the login is refused."""
+        """Raises InputError: name or huggingface_hub is missing; UnavailableError: the login is refused."""
         if not _REPOSITORY.fullmatch(repository):
             raise InputError(f"{repository!r} is no repository; give --to hf://ORGANISATION/NAME")
         try:

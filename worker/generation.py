@@ -349,7 +349,7 @@ class Scoring(AbstractContextManager["Scoring"]):
     def second_verdicts(
         self, grasps: GraspSet, held: NDArray[np.bool_], rows: NDArray[np.intp], run: ExecutionContext
     ) -> Arrays:
-        """Return the columns of `engine_columns`; second engines validate `rows` of the grasps `held` (N,) in MuJoCo.
+        """Return `engine_columns`; second engines validate `rows` of the grasps `held` (N,) in MuJoCo.
         Raises InputError: an engine cannot simulate the hand."""
         assert self.pieces is not None
         columns: Arrays = {"quality/held_in": held.astype(np.uint8), "quality/agreement": np.full(len(grasps), np.nan)}

@@ -162,7 +162,7 @@ class Jobs:
         )
 
     def change(self, action: str, wanted: Iterable[Any]) -> tuple[int, list[str]]:
-        """Cancel, retry or delete jobs, or submit requests; return the number of successes, and causes of refusals."""
+        """Cancel, retry, delete or submit jobs; return the number of successes and causes of refusals."""
         acts: dict[str, Callable[[Any], object]]
         acts = {"submit": self.submit, "cancel": self.cancel, "retry": self.retry, "delete": self.delete}
         changed, problems = 0, []

@@ -88,7 +88,7 @@ class Overview:
         return self._services.index.overview.stats(scope=project_scope())
 
     def valid_per_minute(self) -> dict[str, int]:
-        """Return the numbers of valid grasps made in each of the last `MINUTES`, by minute (UTC), oldest first."""
+        """Return numbers of valid grasps in each of the last `MINUTES`, by minute (UTC), oldest first."""
         start = datetime.now(UTC) - timedelta(minutes=MINUTES - 1)
         minutes = [f"{start + timedelta(minutes=minute):%Y-%m-%dT%H:%M}" for minute in range(MINUTES)]
         made = self._services.index.overview.valid_per_minute(since=minutes[0], scope=project_scope())

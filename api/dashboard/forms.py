@@ -153,7 +153,7 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
 
 
 def _snippet(form: dict[str, Any]) -> tuple[str, str]:
-    """Return the call of `graspd.Client` and the command that submit a form's job; only valid options are in them."""
+    """Return the call of `graspd.Client` and the command that submit a form's job, with valid options."""
     words = [str(form["hand"]), str(form["object"])]
     calls, command = [repr(word) for word in words], ["graspd", "submit", "--hand", words[0], "--object", words[1]]
     with suppress(ValueError, GraspdError):
@@ -220,7 +220,7 @@ def split_list(text: str) -> list[str]:
 
 
 def parse_lists(form: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a form without empty fields, with lists parsed; InputError for a planner's option without a value."""
+    """Return a form's fields with lists parsed. Raises InputError: a planner's option has no value."""
     found = {one.name: split_list(str(form.get(one.name, ""))) for one in INPUTS if one.many}
     form = {name: value for name, value in form.items() if value != ""}
     return {**form, **found, "options": parse_pairs(found["options"])}

@@ -205,7 +205,7 @@ def upload_set(
     wait: bool = True,
     say: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Upload objects, wait for their checks, and make a set of those that are not refused; `split`: also its sides.
+    """Upload objects, wait for their checks, and make a set of accepted ones; `split`: also its sides.
 
     Return name, verdict, message and repairs of each object; `say` is called with a line after each check.
     """

@@ -1,4 +1,4 @@
-"""Command line: `graspd export`, `graspd import`, `graspd datasets card` and `graspd datasets publish`."""
+"""Commands `graspd export`, `graspd import`, `graspd datasets card` and `graspd datasets publish`."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ _RECORD = "check.json"
 
 
 def _prepare_set(objects: Objects, published: PublishedSet, folder: Path) -> Iterator[dict[str, Any]]:
-    """Yield the check of each object, and write accepted ones with their `asset.json`; earlier checks are reused."""
+    """Yield the check of each object; write accepted ones with their `asset.json`. Checks are reused."""
     waiting = {name: files for name, files in objects.items() if _held_record(folder / name) is None}
     tasks = [(name, files, published, folder / name) for name, files in waiting.items()]
     workers = ProcessPoolExecutor(available_cores(), mp_context=get_context("spawn"))
@@ -178,7 +178,7 @@ def _read_folder(folder: Path) -> dict[str, bytes]:
 
 
 def _summary(reports: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return counts of a checked set: refusals and repairs by kind, classes by side of the split, and times [s]."""
+    """Return counts of a checked set: refusals, repairs, classes by side of the split, and times [s]."""
     accepted = [one for one in reports if one["verdict"] != "refuse"]
     half, most = np.quantile([one["seconds"] for one in reports], [0.5, 0.99])
     shapes = Counter(f"{one['shape']['class']} {one['shape']['split']}" for one in accepted)

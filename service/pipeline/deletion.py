@@ -253,7 +253,7 @@ class GarbageCollector:
         return False
 
     def collect(self, budget_s: float = BUDGET_S) -> bool:
-        """Delete refused uploads, objects whose grace time is over, unneeded shards; return whether work is left."""
+        """Delete refused uploads, expired objects and unneeded shards; return whether work is left."""
         deadline = self._clock() + budget_s
         if self._delete_refused(deadline):
             return True

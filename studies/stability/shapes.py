@@ -1,4 +1,4 @@
-"""Stability studies: planners on difficult shapes (thin, sharp, open, tiny, huge), prepared like uploads."""
+"""Stability studies: planners on thin, sharp, open, tiny and huge shapes, prepared like uploads."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

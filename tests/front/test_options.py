@@ -128,7 +128,7 @@ def test_the_api_filters_and_sorts_by_it_and_tells_it(found: Found) -> None:
 
 def test_the_dashboard_has_its_column_filter_and_distribution(found: Found) -> None:
     page = found["list"]
-    assert f"sort={NAME}" in page and f'name="min_{NAME}"' in page and 'max="50"' in page
+    assert f"sort={NAME}" in page and f'name="min_{NAME}"' in page and 'max="20"' in page
     assert TITLE in found["grasp page"] and TITLE in found["job page"]
 
 

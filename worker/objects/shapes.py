@@ -49,8 +49,9 @@ def shape_facts(obj: ObjectModel) -> dict[str, Any]:
 
 
 def box_sides(obj: ObjectModel) -> tuple[float, float, float]:
-    """Return thickness, width and length [m] of a tight box around the convex hull: the least extent along a normal of
-    the hull, and across it the rectangle of least area with a side along an edge of the hull."""
+    """Return thickness, width and length [m] of a tight box around the convex hull.
+
+    Thickness: least extent along a normal of the hull. Across it: rectangle of least area along an edge of the hull."""
     corners, points = obj.hull_vertices[obj.hull_faces], obj.hull_vertices
     normals = _unit(face_vectors(points, obj.hull_faces))
     extents = np.ptp(points @ normals.T, axis=0)

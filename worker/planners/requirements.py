@@ -214,7 +214,7 @@ class Requirements:
     def fulfilled(
         self, hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps | None, device: str = "cpu"
     ) -> NDArray[np.bool_]:
-        """Return a mask (N,) of grasps of the whole hand with the required type, region, approach and wrist pose."""
+        """Return a mask (N,) of grasps with the required type, region, approach and wrist pose."""
         out = self._is_like(grasp)
         if (axes := self.axes(placed, len(grasp))) is not None:
             out &= _cosine(hand, grasp, axes) >= np.cos(self.cone)

@@ -240,7 +240,7 @@ class _Launch:
         return fingers_off_object(hand, obj, candidates.posture_of(hand, obj, state), device=device)
 
     def unlike(self, data: Data, count: int) -> NDArray[np.bool_]:
-        """Return a mask (count,) of hands after the coarse phase that will hardly have the required arrangement."""
+        """Return a mask (count,) of coarse hands that will hardly have the required arrangement."""
         wanted, hand = self.batches.requirements, self.batches.hand
         if hand is None or not wanted.out_of_line:
             return np.zeros(count, bool)

@@ -1,4 +1,4 @@
-"""Drake on the CPU (Tedrake et al. 2019): convex contact with lagged friction (Castro et al. 2023), steps of 8 ms.
+"""Drake on the CPU (Tedrake et al. 2019): lagged convex contact (Castro et al. 2023), 8 ms steps.
 
 Contacts are hydroelastic patches on supports and with at most two drives. All others are one point per pair of shapes,
 without torsional friction."""

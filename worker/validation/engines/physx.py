@@ -1,4 +1,4 @@
-"""PhysX 5 on the CPU, through SAPIEN (Xiang et al. 2020): TGS solver, steps of 4 ms, hand in reduced coordinates.
+"""PhysX 5 on the CPU by SAPIEN (Xiang et al. 2020): TGS, steps of 4 ms, reduced coordinates.
 
 Contacts are rigid, with patch friction and torsional friction."""
 

@@ -131,7 +131,7 @@ class Simulation(Protocol):
 
 
 class Engine(Protocol):
-    """Module of one engine, imported only when it is used. It states solver, contact and friction model, time step."""
+    """Module of one engine, imported at its first use; it states solver, contact model and time step."""
 
     def limitations(self, model: EngineModel) -> Sequence[str]:
         """Return what this engine cannot simulate in a model, each as a short noun phrase; empty if nothing."""
