@@ -200,6 +200,7 @@ VALUES: dict[str, Any] = {
     **dict.fromkeys(_TEXTS, _ODD),
     **dict.fromkeys(_SECRETS, SecretStr(f"{_ODD} and at least sixteen")),
     **{name: Path(f"/srv/{_ODD}/{name}") for name in _PATHS},
+    "price_unit": "EUR",
     "proxy_groups": {'lab, the "first"': "vision:submit", "ü": ":admin", "*": ":read"},
     "metrics_need_key": False,
     "log_level": "DEBUG",
