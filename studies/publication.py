@@ -3,7 +3,6 @@
 The folder is complete or absent: files are written below `.FOLDER.part`, each under a temporary name, and this folder
 is renamed at the end. A repeated call continues an interrupted one. One shard or picture at a time is in memory."""
 
-import hashlib
 import json
 import re
 from collections.abc import Callable, Iterator
@@ -20,7 +19,7 @@ from graspd.exchange.opening import check_written_files
 from graspd.exchange.plan import held_out_objects, plain_name
 from graspd.exchange.training_export import object_families, shape_signature
 from graspd.service import parquet
-from graspd.service.model.digests import digest_json
+from graspd.service.model.digests import digest_json, file_sha256
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, UnavailableError
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.readers import Pictures, ShardFile
@@ -98,7 +97,7 @@ def publish(contents: Contents, folder: Path, options: PublicationOptions, progr
         _write_json(draft / "licences.json", {"dataset": options.licence or None, **assets})
         if contents.snapshot is not None:
             (draft / "snapshot.json").write_text(contents.snapshot.model_dump_json(indent=1) + "\n")
-        sums = {file: _sha256(file) for found in files.values() for file in found}
+        sums = {file: file_sha256(file) for found in files.values() for file in found}
         facts = [{"name": str(f.relative_to(draft)), "size": f.stat().st_size, "sha256": s} for f, s in sums.items()]
         tables = {
             table: {name: _croissant_type(word) for name, word in columns.items()}
@@ -107,7 +106,7 @@ def publish(contents: Contents, folder: Path, options: PublicationOptions, progr
         }
         (draft / "croissant.json").write_text(render_croissant(card, facts, tables))
     written = sorted(file for file in draft.rglob("*") if file.is_file() and file.name != CHECKSUMS)
-    lines = (f"{sums.get(file) or _sha256(file)}  {file.relative_to(draft)}\n" for file in written)
+    lines = (f"{sums.get(file) or file_sha256(file)}  {file.relative_to(draft)}\n" for file in written)
     (draft / CHECKSUMS).write_text("".join(lines))
     draft.rename(folder)
 
@@ -213,11 +212,6 @@ def _croissant_type(word: str) -> tuple[str, str]:
     """Return Croissant's type and shape of a column; the last suffix of a type's name is the outer list."""
     kind, lengths = word.split("[")[0], re.findall(r"\[(\d*)\]", word)
     return _TYPES.get(kind, f"cr:{kind.capitalize()}"), ",".join(length or "-1" for length in reversed(lengths))
-
-
-def _sha256(file: Path) -> str:
-    with file.open("rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
 class Hub:

@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 
 from graspd.service.index.views import GraspView
 from graspd.service.model.metrics import GraspType
-from graspd.service.model.transforms import quat_rotate
+from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.service.store.shards import Shard
 
-Floats = NDArray[np.float64]
 _DIGITS: Final = 6
 
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Final
 
 from graspd.service.model.domain import JobRequest, count_batches
@@ -18,6 +19,12 @@ _PAYLOAD_REVISION: Final = 2
 def digest_bytes(data: bytes) -> str:
     """Return the first 32 hexadecimal digits of the SHA-256 of `data`."""
     return hashlib.sha256(data).hexdigest()[:32]
+
+
+def file_sha256(path: Path) -> str:
+    """Return the whole SHA-256 of a file in hexadecimal digits, as checksum lists state it."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def digest_json(value: object) -> str:

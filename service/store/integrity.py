@@ -20,6 +20,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
+from graspd.service.model.digests import file_sha256
 from graspd.service.model.errors import DamagedError, DamagedShard, NotFoundError
 from graspd.service.store.store import STREAM_BYTES, Stamp, Store
 
@@ -140,8 +141,7 @@ def check_content(path: Path, sha256: str | None) -> None:
     if _known.get(path) == stamp:
         return
     if sha256 is not None:
-        with path.open("rb") as file:
-            check_digest(str(path), hashlib.file_digest(file, "sha256").hexdigest(), sha256)
+        check_digest(str(path), file_sha256(path), sha256)
     if len(_known) >= _REMEMBERED:
         _known.clear()
     _known[path] = stamp

@@ -2,7 +2,6 @@
 
 A wheel is data only: it is never installed, and its code is never run."""
 
-import hashlib
 import posixpath
 import re
 import subprocess
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from graspd.service import user_cache
+from graspd.service.model.digests import file_sha256
 from graspd.service.model.errors import InputError, LimitError, NotFoundError, did_you_mean
 from graspd.service.store import body_files
 from graspd.service.store.assets import check_path
@@ -106,9 +106,8 @@ def fetch_wheel(package: str, version: str, sha256: str) -> Path:
 
 def _find_wheel(folder: Path, package: str, version: str, sha256: str) -> Path | None:
     for wheel in folder.glob(f"{package}-{version}-*.whl"):
-        with wheel.open("rb") as opened:
-            if hashlib.file_digest(opened, "sha256").hexdigest() == sha256:
-                return wheel
+        if file_sha256(wheel) == sha256:
+            return wheel
         wheel.unlink()
     return None
 

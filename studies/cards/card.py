@@ -1,6 +1,5 @@
 """A card in a folder: README.md, card.json, checksums.sha256, plots, and sample pictures."""
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from graspd.service.model.digests import file_sha256
 from graspd.service.model.errors import InputError
 from graspd.service.pipeline.datasets.export import path_of
 from graspd.service.readers import ShardFile, Shards
@@ -77,8 +77,7 @@ def checksum_lines(contents: Contents) -> Iterator[str]:
     paths = sorted(contents.shards.path(file) for file in contents.shards)
     root = contents.root or Path()
     for path in paths:
-        with path.open("rb") as opened:
-            yield f"{hashlib.file_digest(opened, 'sha256').hexdigest()}  {path.relative_to(root)}\n"
+        yield f"{file_sha256(path)}  {path.relative_to(root)}\n"
 
 
 def write_samples(shards: Shards, file: Path) -> bool:

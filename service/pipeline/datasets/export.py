@@ -1,11 +1,11 @@
 """Export of a snapshot as files in a folder, with verified checksums; existing files are skipped."""
 
-import hashlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
 from graspd.service.cli import write_output
+from graspd.service.model.digests import file_sha256
 from graspd.service.model.errors import InputError
 from graspd.service.model.records import Snapshot, SnapshotShard
 from graspd.service.store.integrity import CHECKSUMS, checked_chunks
@@ -52,5 +52,4 @@ def _make_folder(folder: Path) -> None:
 def _is_exported(path: Path, shard: SnapshotShard) -> bool:
     if not path.is_file() or path.stat().st_size != shard.size_bytes:
         return False
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest() == shard.sha256
+    return file_sha256(path) == shard.sha256
