@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 from graspd.exchange.inputs import load_case
 from graspd.exchange.plan import ExportSummary
 from graspd.exchange.robots.bundle import Bundle, Carrier
-from graspd.exchange.robots.execution import (
+from graspd.service.model.errors import InputError
+from graspd.service.model.transforms import IDENTITY_POSE
+from graspd.service.store.shards import Shard, read_shard
+from graspd.worker.episodes.execution import (
     ASSUMED_M_S,
     ASSUMED_RAD_S,
     Executions,
@@ -22,10 +25,7 @@ from graspd.exchange.robots.execution import (
     tool_frame,
     velocity_limits,
 )
-from graspd.exchange.robots.reach import HandDescription, ReachSearch, read_arm, read_description
-from graspd.service.model.errors import InputError
-from graspd.service.model.transforms import IDENTITY_POSE
-from graspd.service.store.shards import Shard, read_shard
+from graspd.worker.episodes.reach import HandDescription, ReachSearch, read_arm, read_description
 from graspd.worker.files.provenance import hand_files_of_shard
 from graspd.worker.files.subsets import select_grasps
 from graspd.worker.rendering.sheets import best_rows as best_of

@@ -8,9 +8,9 @@ import numpy as np
 import yaml
 
 from graspd.exchange.plan import plain_name, prim_names
-from graspd.exchange.robots.execution import Executions, Path, RobotTrajectory
-from graspd.exchange.robots.reach import Arm, ArmScene, HandDescription
 from graspd.service.model.transforms import Floats, compose, invert
+from graspd.worker.episodes.execution import Executions, Path, RobotTrajectory
+from graspd.worker.episodes.reach import Arm, ArmScene, HandDescription
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ import numpy as np
 from graspd.exchange.imported import urdf_text, write_mesh
 from graspd.exchange.plan import plain_name
 from graspd.exchange.robots.bundle import Bundle, dump_yaml, rounded_numbers
-from graspd.exchange.robots.execution import RobotTrajectory
 from graspd.service.model.transforms import Floats
+from graspd.worker.episodes.execution import RobotTrajectory
 
 #: Share of a straight motion that MoveIt must be able to make for a grasp (`min_distance`).
 LEAST_SHARE: Final = 0.5

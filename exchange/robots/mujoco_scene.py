@@ -14,9 +14,9 @@ import numpy as np
 
 from graspd.exchange.plan import plain_name
 from graspd.exchange.robots.bundle import Bundle, Carrier
-from graspd.exchange.robots.execution import POSTURES, Executions
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import compose
+from graspd.worker.episodes.execution import POSTURES, Executions
 from graspd.worker.hands.model import HandModel
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions, Scene, build_scene, scene_spec

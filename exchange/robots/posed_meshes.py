@@ -10,9 +10,9 @@ import numpy as np
 
 from graspd.exchange.plan import plain_name, prim_names
 from graspd.exchange.robots.bundle import Bundle
-from graspd.exchange.robots.execution import Executions, RobotTrajectory, posed_bodies
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, pose_to_matrix
+from graspd.worker.episodes.execution import Executions, RobotTrajectory, posed_bodies
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.primitives import hull
 from graspd.worker.hands.robot import Ints

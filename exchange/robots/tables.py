@@ -13,8 +13,8 @@ import numpy as np
 
 from graspd.exchange.plan import plain_name, prim_name
 from graspd.exchange.robots.bundle import Bundle, dump_yaml, rounded_numbers
-from graspd.exchange.robots.execution import POSTURES
 from graspd.service.model.transforms import POSE_PARTS, compose, invert
+from graspd.worker.episodes.execution import POSTURES
 
 
 def write_tables(bundle: Bundle, folder: Path) -> list[Path]:

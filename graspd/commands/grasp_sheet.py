@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from graspd.exchange.robots import execution
 from graspd.service.model.scene_spec import scene_supports
 from graspd.service.model.transforms import compose, invert
 from graspd.service.readers.trajectories import Waypoint, planned_scene_of, trajectory_of, wrist_angles
 from graspd.service.store.shards import Shard
+from graspd.worker.episodes import execution
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.provenance import neighbours_of_shard, scenes_of_shard
 from graspd.worker.grasps import GraspSet, Posture

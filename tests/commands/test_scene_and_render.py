@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 from graspd.cli import build_app
 from graspd.commands import grasp_sheet, render
 from graspd.commands.grasp_sheet import AFTER_S, BEFORE_S
-from graspd.exchange.robots.execution import SHORTEST_S
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.shards import json_attribute, read_shard, write_shard
+from graspd.worker.episodes.execution import SHORTEST_S
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.rendering import portraits

@@ -10,9 +10,9 @@ import pytest
 import yaml
 import yourdfpy
 
-from graspd.exchange.robots.execution import ASSUMED_RAD_S
-from graspd.exchange.robots.reach import read_arm
 from graspd.service.model.transforms import IDENTITY_POSE, compose, pose_from_matrix
+from graspd.worker.episodes.execution import ASSUMED_RAD_S
+from graspd.worker.episodes.reach import read_arm
 from tests.exchange.robots.arms import JOINTS, rows, write_arm
 from tests.worker.commands_run import graspd, refused
 

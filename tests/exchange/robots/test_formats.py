@@ -20,8 +20,11 @@ from graspd.commands.exchange import ROBOTS
 from graspd.exchange.inputs import load_case
 from graspd.exchange.opening import READERS, check_written_files
 from graspd.exchange.plan import prim_name, prim_names
-from graspd.exchange.robots import execution
-from graspd.exchange.robots.execution import (
+from graspd.service.model.errors import GraspdError, InputError
+from graspd.service.model.transforms import IDENTITY_POSE, apply, compose, invert, pose_to_matrix, quat_to_matrix, slerp
+from graspd.service.store.shards import read_shard, write_shard
+from graspd.worker.episodes import execution
+from graspd.worker.episodes.execution import (
     POSTURES,
     Executions,
     build_executions,
@@ -29,9 +32,6 @@ from graspd.exchange.robots.execution import (
     time_motions,
     tool_frame,
 )
-from graspd.service.model.errors import GraspdError, InputError
-from graspd.service.model.transforms import IDENTITY_POSE, apply, compose, invert, pose_to_matrix, quat_to_matrix, slerp
-from graspd.service.store.shards import read_shard, write_shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.rendering.hands import hand_parts

@@ -12,7 +12,6 @@ import trimesh
 from PIL import Image, ImageSequence, features
 
 from graspd.commands.grasp_sheet import waypoints
-from graspd.exchange.robots.execution import POSTURES, Executions, ToolFrame, straight_paths, time_motions
 from graspd.readers import hand_surface
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec, scene_supports
@@ -20,6 +19,7 @@ from graspd.service.model.transforms import apply, compose, invert, quat_rotate
 from graspd.service.readers import Pictures, open_shards
 from graspd.service.readers.trajectories import Waypoint
 from graspd.service.store.shards import Shard, write_shard
+from graspd.worker.episodes.execution import POSTURES, Executions, ToolFrame, straight_paths, time_motions
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path, load_hand

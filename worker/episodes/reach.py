@@ -13,12 +13,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.exchange.robots.execution import Executions, Path, straight_paths
 from graspd.service.model.digests import digest_files
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
-from graspd.service.model.transforms import Floats
+from graspd.service.model.transforms import Floats, compose
 from graspd.worker.engines.mujoco_warnings import ARENA
+from graspd.worker.episodes.execution import Executions, Path, straight_paths
 from graspd.worker.hands.collisions import collision_exempt_pairs
 from graspd.worker.hands.load import HandSource, body_model, files_from_path
 from graspd.worker.hands.model import HandModel
@@ -39,6 +39,10 @@ class Arm:
     mount_body: int
     mount_pose: Floats  # (7,) pose of the mount link in its body's frame
     hand_pose: Floats  # (7,) pose of the hand's root link in the mount link's frame
+
+    def root_pose(self, body_pose: Floats) -> Floats:
+        """Return poses (..., 7) of the hand's root link for poses of the body that carries the mount."""
+        return compose(compose(body_pose, self.mount_pose), self.hand_pose)
 
 
 def read_arm(path: str | pathlib.Path, mount: str, hand_pose: Floats) -> Arm:

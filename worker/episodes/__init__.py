@@ -1,0 +1,1 @@
+"""Episodes: executed grasps of an arm or a flying hand."""
