@@ -1,5 +1,6 @@
 """Motions: timed targets of a robot that executes one grasp, from its home posture to the lifted object."""
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,13 +22,16 @@ CONTROL_STEP_S: Final = 0.02
 #: Duration of each phase where limits allow [s].
 NOMINAL_S: Final = dict(zip(PHASES, (1.0, 0.7, 0.3, 0.4, 0.3, 0.8, 0.5), strict=True))
 #: Home of a flying hand: its palm here in the scene, facing down, and half the range of seeded changes [m], [rad].
-FLYING_HOME_M: Final = (-0.25, 0.0, 0.35)
+FLYING_HOME_M: Final = (-0.4, 0.0, 0.3)
 FLYING_CHANGE_M: Final = 0.05
 FLYING_CHANGE_RAD: Final = 0.5
-#: Heights above the standoff of points by which a flying hand avoids obstacles [m].
+#: Heights above home and standoff at which a flying hand passes obstacles [m].
 DETOURS_M: Final = (0.1, 0.2, 0.3)
-#: Numbers of tested postures of a transit, and of control points of one with corners, tried in turn.
-CHECKS: Final = 60
+#: Clearance of a transit [m]; less if the standoff has less.
+CLEARANCES_M: Final = (0.01, 0.002, 0.0)
+#: Time between tested postures of a transit at full velocity [s].
+CHECK_S: Final = 0.01
+#: Numbers of control points of a transit with corners, tried in turn.
 CONTROLS: Final = (12, 24, 48)
 #: Margin of sampled postures around both ends of an arm's transit [rad or m].
 WIDER: Final = 1.5
@@ -54,6 +58,7 @@ class MotionPlanner:
         self.robot, self.found, self.seed, self.step = robot, found, seed, step
         self.limits = MotionLimits.of_robot(robot)
         self._split = len(robot.names) - robot.hand.dofs  # number of the arm's dofs, or of the root pose's values
+        self._clearance = CLEARANCES_M[0]
         if robot.arm is None:
             self._world = ArmScene(None, robot.base, robot.hand, pieces, found.placed)
         else:
@@ -74,8 +79,10 @@ class MotionPlanner:
         ]
         end = paths[0][0]
         home = np.concatenate([flying_home(hand, rng), end[7:]])
-        detours = (np.stack([home, end + height * np.eye(len(end))[2], end]) for height in DETOURS_M)
-        for corners in (np.stack([home, end]), *detours):
+        self._choose_clearance(end, row)
+        for height in (0.0, *DETOURS_M):
+            corners = np.stack([home, home, end, end] if height else [home, end])
+            corners[1:-1, 2] = max(home[2], end[2]) + height
             if (transit := self._free_path(corners, row)) is not None:
                 return self._timed([transit, *paths])
         return EpisodeOutcome.NO_TRANSIT
@@ -107,6 +114,7 @@ class MotionPlanner:
         assert self.robot.arm is not None
         tree, home, held = self.robot.arm.model, self.robot.arm.home, end[self._split :]
         corners = np.stack([np.concatenate([home, held]), end])
+        self._choose_clearance(end, row)
         if (path := self._free_path(corners, row)) is not None:
             return path
         goal = end[: self._split]
@@ -123,14 +131,21 @@ class MotionPlanner:
         """Return a path (M, D) near lines between corners (C, D) whose curve is free, or None."""
         for points in CONTROLS if len(corners) > 2 else (4,):
             path = self.limits.resampled(corners, points)
-            # The end is the most likely posture to collide.
-            if all(self._is_free(state, row) for state in self.limits.curve(path, np.linspace(1, 0, CHECKS))):
+            shares = np.linspace(0, 1, math.ceil(self.limits.least_times(path)[-1] / CHECK_S) + 1)
+            if all(self._is_free(state, row) for state in self.limits.curve(path, shares)):
                 return path
         return None
 
     def _is_free(self, state: Floats, row: int) -> bool:
         joints = self.robot.hand.expand(state[self._split :])
-        return not self._world.first_collision(state[: self._split], joints, self.found.object_pose[row], whole=True)
+        world, rest = self._world, self.found.object_pose[row]
+        return not world.first_collision(state[: self._split], joints, rest, clearance=self._clearance)
+
+    def _choose_clearance(self, end: Floats, row: int) -> None:
+        """Choose the largest clearance that the end of a transit has."""
+        for self._clearance in CLEARANCES_M:
+            if self._is_free(end, row):
+                break
 
     def _timed(self, paths: list[Floats]) -> Motion:
         """Return the sequence of timed paths (M, D), all from rest to rest, and the hold."""

@@ -369,11 +369,10 @@ class ArmScene:
         self.hand_qpos = _joint_addresses(self.model, hand, "hand")
         self._object = int(self.model.body("object").mocapid[0])
         names = [self.model.body(b).name for b in range(self.model.nbody)]
-        hands = np.array([name.startswith("hand") for name in names])
-        self._hand_bodies, self._hand_geoms = hands, hands[self.model.geom_bodyid]
-        around = np.array([name in ("object", "world") or name.startswith("neighbour") for name in names])
-        self.model.geom_conaffinity[around[self.model.geom_bodyid]] |= _WHOLE
-        self.model.body_conaffinity[around] |= _WHOLE
+        self._hand = np.array([name.startswith("hand") for name in names])
+        self._around = np.array([name in ("object", "world") or name.startswith("neighbour") for name in names])
+        self.model.geom_conaffinity[self._around[self.model.geom_bodyid]] |= _WHOLE
+        self.model.body_conaffinity[self._around] |= _WHOLE
 
     def place_neighbours(self, row: int) -> None:
         """Place the neighbours of a grasp's scene, before collisions of that grasp are tested."""
@@ -382,17 +381,23 @@ class ArmScene:
             first = self._object + 1
             self.data.mocap_pos[first:], self.data.mocap_quat[first:] = poses[:, :3], poses[:, 3:]
 
-    def first_collision(self, carrier: Floats, hand_joints: Floats, object_pose: Floats, *, whole: bool = False) -> str:
+    def first_collision(
+        self, carrier: Floats, hand_joints: Floats, object_pose: Floats, *, clearance: float | None = None
+    ) -> str:
         """Return a colliding pair, or an empty text if there is none.
-        The posture is given by arm dofs (A,) or root pose (7,), hand joints (J,) and object pose (7,). Contacts of the
-        hand with its surroundings count if `whole`; contacts of the arm always count."""
-        self.model.geom_contype[self._hand_geoms] = self.model.body_contype[self._hand_bodies] = _WHOLE * whole
+        The posture is given by arm dofs (A,) or root pose (7,), hand joints (J,) and object pose (7,). With a
+        `clearance` [m], hand and arm must have it from their surroundings; else only contacts of the arm count."""
+        hand, around, margin = self._hand, self._around, clearance or 0.0
+        self.model.geom_contype[hand[self.model.geom_bodyid]] = self.model.body_contype[hand] = _WHOLE * (
+            clearance is not None
+        )
+        self.model.geom_margin[around[self.model.geom_bodyid]] = self.model.body_margin[around] = margin
         self._put(self.model, self.data, carrier, hand_joints)
         self.data.mocap_pos[self._object], self.data.mocap_quat[self._object] = object_pose[:3], object_pose[3:]
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_collision(self.model, self.data)
         for contact in self.data.contact:
-            if contact.dist < 0:
+            if contact.dist < margin:
                 return " and ".join(self._geom_label(int(geom)) for geom in contact.geom)
         return ""
 

@@ -14,7 +14,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 
 #: Distance of an arm's base from the scene's origin [m].
-BEHIND_M: Final = 0.6
+BEHIND_M: Final = 0.5
 #: Thickness of the adapter between flange and hand [m].
 ADAPTER_M: Final = 0.01
 

@@ -87,13 +87,16 @@ class MotionLimits:
         count = math.ceil(seconds / step - 1e-9)
         return self.curve(path, minimum_jerk(np.arange(1, count + 1) / count))
 
+    def least_times(self, corners: Floats) -> Floats:
+        """Return times (C,) at corners (C, D) of lines that are passed at full velocity [s]."""
+        times = (self.rates(np.diff(self.continuous(corners), axis=0)) / self.velocity).max(axis=1)
+        return np.concatenate([[0.0], np.cumsum(np.maximum(times, 1e-9))])
+
     def resampled(self, corners: Floats, points: int) -> Floats:
         """Return states (points, D) on lines between corners (C, D), at equal shares of the time at full velocity."""
-        corners = self.continuous(corners)
-        times = (self.rates(np.diff(corners, axis=0)) / self.velocity).max(axis=1)
-        at = np.concatenate([[0.0], np.cumsum(np.maximum(times, 1e-9))])
+        at = self.least_times(corners)
         wanted = np.linspace(0.0, at[-1], points)
-        return np.stack([np.interp(wanted, at, column) for column in corners.T], axis=1)
+        return np.stack([np.interp(wanted, at, column) for column in self.continuous(corners).T], axis=1)
 
 
 def minimum_jerk(time: Floats) -> Floats:

@@ -12,7 +12,7 @@ from graspd.service.model.transforms import Floats
 
 #: Length of a tree's steps and largest distance of tested points, by the joint that moves most [rad or m].
 STEP: Final = 0.25
-RESOLUTION: Final = 0.05
+RESOLUTION: Final = 0.03
 #: Numbers of samples until the search ends without a path, and of attempts to shorten a path.
 SAMPLES: Final = 400
 SHORTCUTS: Final = 60
