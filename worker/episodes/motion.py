@@ -1,6 +1,5 @@
 """Motions: timed targets of a robot that executes one grasp, from its home posture to the lifted object."""
 
-import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -29,7 +28,7 @@ FLYING_CHANGE_RAD: Final = 0.5
 DETOURS_M: Final = (0.1, 0.2, 0.3)
 #: Clearance of a transit [m]; less if the standoff has less.
 CLEARANCES_M: Final = (0.01, 0.002, 0.0)
-#: Time between tested postures of a transit at full velocity [s].
+#: Time between tested postures of a transit that is as fast as limits allow [s].
 CHECK_S: Final = 0.01
 #: Numbers of control points of a transit with corners, tried in turn.
 CONTROLS: Final = (12, 24, 48)
@@ -131,8 +130,7 @@ class MotionPlanner:
         """Return a path (M, D) near lines between corners (C, D) whose curve is free, or None."""
         for points in CONTROLS if len(corners) > 2 else (4,):
             path = self.limits.resampled(corners, points)
-            shares = np.linspace(0, 1, math.ceil(self.limits.least_times(path)[-1] / CHECK_S) + 1)
-            if all(self._is_free(state, row) for state in self.limits.curve(path, shares)):
+            if all(self._is_free(state, row) for state in self.limits.timed(path, 0.0, CHECK_S)):
                 return path
         return None
 

@@ -42,39 +42,23 @@ class Arm:
     mount_pose: Floats  # (7,) pose of the mount link in its body's frame
     hand_pose: Floats  # (7,) pose of the hand's root link in the mount link's frame
     home: Floats  # (A,) dofs at the start of an episode, and first start of inverse kinematics
-    acceleration: Floats  # (A,) limits [rad/s^2 or m/s^2]
 
     def root_pose(self, body_pose: Floats) -> Floats:
         """Return poses (..., 7) of the hand's root link for poses of the body that carries the mount."""
         return compose(compose(body_pose, self.mount_pose), self.hand_pose)
 
 
-#: Acceleration limit of a joint without a published one [rad/s^2], [m/s^2].
-ASSUMED_RAD_S2: Final = 10.0
-ASSUMED_M_S2: Final = 2.0
-
-
-@dataclass(frozen=True)
-class BuiltinArm:
-    """What the description of a built-in arm, `service/builtin/arms`, does not state; its mount is `flange`."""
-
-    home: tuple[float, ...]  # the flange ahead of the base, pointing down [rad]
-    acceleration: tuple[float, ...] | None  # [rad/s^2]; None if the manufacturer publishes none
-
-
+#: Home of each built-in arm, `service/builtin/arms`: the flange ahead of the base, pointing down [rad].
 BUILTIN_ARMS: Final = {
-    "franka": BuiltinArm(
-        (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4),
-        (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0),
-    ),
-    "ur10e": BuiltinArm((math.pi, -2.2, 2.0, 0.2 - math.pi / 2, -math.pi / 2, 0.0), None),
+    "franka": (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4),
+    "ur10e": (math.pi, -2.2, 2.0, 0.2 - math.pi / 2, -math.pi / 2, 0.0),
 }
 
 
 def read_arm(path: str | pathlib.Path, mount: str | None, hand_pose: Floats) -> Arm:
     """Read a built-in arm, or one from a URDF, its folder or a ZIP, without links below the mount, such as a gripper.
-    Joints that do not lead to the mount are fixed at zero, or at the nearest value inside their limits. Raises
-    InputError: there is no such arm, no link `mount`, or no joint moves it; an arm from a file has no default mount."""
+    Joints that do not lead to the mount are fixed at zero, or at the nearest value inside their limits. A built-in arm
+    has the mount `flange`. Raises InputError: there is no such arm, no link `mount`, or no joint moves it."""
     builtin = BUILTIN_ARMS.get(str(path))
     if builtin is not None:
         mount = mount or "flange"
@@ -109,18 +93,8 @@ def read_arm(path: str | pathlib.Path, mount: str | None, hand_pose: Floats) -> 
     model = body_model(replace(source, options=chosen), tree)
     model = replace(model, neighbours=collision_exempt_pairs(model))
     body, pose = tree.links[mount]
-    lead = model.joint_type[model.joint_body[model.first_joint]]
-    assumed = np.where(lead == JointType.REVOLUTE, ASSUMED_RAD_S2, ASSUMED_M_S2)
-    stated_home = None if builtin is None else np.array(builtin.home)
-    return Arm(
-        model,
-        mount,
-        body,
-        np.asarray(pose, float),
-        hand_pose,
-        0.5 * (model.lower + model.upper) if stated_home is None else stated_home,
-        assumed if builtin is None or builtin.acceleration is None else np.array(builtin.acceleration),
-    )
+    home = 0.5 * (model.lower + model.upper) if builtin is None else np.array(builtin)
+    return Arm(model, mount, body, np.asarray(pose, float), hand_pose, home)
 
 
 @dataclass(frozen=True)

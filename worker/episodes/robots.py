@@ -61,32 +61,25 @@ def adapter_pose(hand: HandModel) -> Floats:
 
 def rotation_between(a: Floats, b: Floats) -> Floats:
     """Return the quaternion (4,) of the smallest rotation from unit vector `a` (3,) to `b` (3,)."""
-    across = np.cross(a, b)
-    if (length := float(np.linalg.norm(across))) < 1e-9:
-        across, length = np.eye(3)[np.argmin(np.abs(a))], 1.0
-        across = np.cross(a, across) / np.linalg.norm(np.cross(a, across))
-        return quat_from_axis_angle(across, np.array(0.0 if a @ b > 0 else np.pi))
-    return quat_from_axis_angle(across / length, np.arctan2(length, a @ b))
+    half = np.array([1.0 + a @ b, *np.cross(a, b)])
+    if half[0] < 1e-9:
+        half = np.array([0.0, *np.cross(a, np.eye(3)[np.argmin(np.abs(a))])])
+    return half / np.linalg.norm(half)
 
 
 def carry_mounting(arm: Arm, hand: HandModel) -> Arm:
     """Return the arm with the hand's forearm, its wrist at rest, as a part of the body that carries the mount."""
     if hand.mounting is None:
         return arm
-    root = compose(arm.mount_pose, arm.hand_pose)
-    poses = compose(root, _rest_poses(hand.mounting))
-    pieces = tuple(
-        replace(
-            piece,
-            body=arm.mount_body,
-            pose=compose(poses[piece.body], piece.pose),
-            vertices=apply(poses[piece.body], piece.vertices),
-        )
-        for piece in hand.mounting.pieces
-    )
+    poses = compose(compose(arm.mount_pose, arm.hand_pose), _rest_poses(hand.mounting))
+    pieces = []
+    for piece in hand.mounting.pieces:
+        at = poses[piece.body]
+        moved = {"pose": compose(at, piece.pose), "vertices": apply(at, piece.vertices)}
+        pieces.append(replace(piece, body=arm.mount_body, **moved))
     masses = np.array(arm.model.masses)
     masses[arm.mount_body] += hand.mounting.masses[1:].sum()  # body 0 is the hand's root
-    return replace(arm, model=replace(arm.model, pieces=arm.model.pieces + pieces, masses=masses))
+    return replace(arm, model=replace(arm.model, pieces=(*arm.model.pieces, *pieces), masses=masses))
 
 
 def base_pose(arm: Arm) -> Floats:
