@@ -36,6 +36,7 @@ CONTROLS: Final = (12, 24, 48)
 WIDER: Final = 1.5
 #: Number of an arm's motions to the grasp from which a transit is tried.
 MOST_TRANSITS: Final = 3
+_NO_TRANSIT: Final = EpisodeOutcome.NO_TRANSIT
 
 
 @dataclass(frozen=True)
@@ -72,10 +73,7 @@ class MotionPlanner:
 
     def _plan_flight(self, row: int, rng: np.random.Generator) -> Motion | EpisodeOutcome:
         hand = self.robot.hand
-        paths = [
-            np.concatenate([path.hand_pose, hand.reduce(path.joints)], axis=1)
-            for path in straight_paths(self.found, row)
-        ]
+        paths = [np.hstack([path.hand_pose, hand.reduce(path.joints)]) for path in straight_paths(self.found, row)]
         end = paths[0][0]
         home = np.concatenate([flying_home(hand, rng), end[7:]])
         self._choose_clearance(end, row)
@@ -84,7 +82,7 @@ class MotionPlanner:
             corners[1:-1, 2] = max(home[2], end[2]) + height
             if (transit := self._free_path(corners, row)) is not None:
                 return self._timed([transit, *paths])
-        return EpisodeOutcome.NO_TRANSIT
+        return _NO_TRANSIT
 
     def _plan_arm(self, row: int, rng: np.random.Generator) -> Motion | EpisodeOutcome:
         reason, tried = "", 0
@@ -98,15 +96,13 @@ class MotionPlanner:
             tried += 1
             if tried == MOST_TRANSITS:
                 break
-        return (
-            EpisodeOutcome.NO_TRANSIT if tried else EpisodeOutcome(EpisodeOutcome.OUT_OF_REACH + reason_stage(reason))
-        )
+        return _NO_TRANSIT if tried else EpisodeOutcome(EpisodeOutcome.OUT_OF_REACH + reason_stage(reason))
 
     def _states(self, path: Path) -> Floats:
         assert self.robot.arm is not None
         tree = self.robot.arm.model
         of_arm, of_hand = np.split(path.joints, [len(tree.joint_names)], axis=1)
-        return np.concatenate([tree.reduce(of_arm), self.robot.hand.reduce(of_hand)], axis=1)
+        return np.hstack([tree.reduce(of_arm), self.robot.hand.reduce(of_hand)])
 
     def _arm_transit(self, end: Floats, row: int, rng: np.random.Generator) -> Floats | None:
         """Return a free path (M, D) of an arm from its home posture, with the hand as at the end, or None."""
@@ -117,14 +113,12 @@ class MotionPlanner:
         if (path := self._free_path(corners, row)) is not None:
             return path
         goal = end[: self._split]
-        low, high = (
-            np.maximum(np.minimum(home, goal) - WIDER, tree.lower),
-            np.minimum(np.maximum(home, goal) + WIDER, tree.upper),
-        )
+        ends = np.stack([np.minimum(home, goal) - WIDER, np.maximum(home, goal) + WIDER])
+        low, high = np.clip(ends, tree.lower, tree.upper)
         free = connect(home, goal, low, high, lambda q: self._is_free(np.concatenate([q, held]), row), rng)
         if free is None:
             return None
-        return self._free_path(np.concatenate([free, np.tile(held, (len(free), 1))], axis=1), row)
+        return self._free_path(np.hstack([free, np.tile(held, (len(free), 1))]), row)
 
     def _free_path(self, corners: Floats, row: int) -> Floats | None:
         """Return a path (M, D) near lines between corners (C, D) whose curve is free, or None."""
@@ -147,9 +141,7 @@ class MotionPlanner:
 
     def _timed(self, paths: list[Floats]) -> Motion:
         """Return the sequence of timed paths (M, D), all from rest to rest, and the hold."""
-        parts = [
-            self.limits.timed(path, NOMINAL_S[phase], self.step) for phase, path in zip(PHASES, paths, strict=False)
-        ]
+        parts = [self.limits.timed(path, NOMINAL_S[PHASES[k]], self.step) for k, path in enumerate(paths)]
         parts.append(np.repeat(paths[-1][-1:], round(NOMINAL_S["hold"] / self.step), axis=0))
         phase = np.repeat(np.arange(len(parts), dtype=np.uint8), [len(part) for part in parts])
         targets = self.limits.continuous(np.concatenate([paths[0][:1], *parts]))

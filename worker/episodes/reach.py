@@ -133,6 +133,7 @@ REASONS: Final = ("out of reach", "no continuous motion", "collision")
 #: Damping of inverse kinematics, of squared errors [m^2], and largest step of a dof [rad or m].
 DAMPING: Final = 0.1
 LARGEST_STEP: Final = 0.5
+_WEIGHTS: Final = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])  # of errors [m] and [rad]
 
 
 def reason_stage(reason: str) -> int:
@@ -149,7 +150,10 @@ class ReachResult:
     """Their motions; joints are the arm's, then the hand's."""
     refused: Counter[str] = field(default_factory=Counter)
     """Number of grasps that the arm cannot execute, by reason."""
-    candidates: int = 0
+
+    @property
+    def candidates(self) -> int:
+        return len(self.rows) + self.refused.total()
 
 
 class ReachSearch:
@@ -171,7 +175,6 @@ class ReachSearch:
         """Search motions for all grasps in their order, or until `wanted` (if above 0) are executable."""
         reached = ReachResult()
         for row in range(len(self.found)):
-            reached.candidates += 1
             paths, reason = self.search_row(row)
             if paths is None:
                 reached.refused[reason] += 1
@@ -260,19 +263,12 @@ class ReachSearch:
 
     def _step(self, q: Floats, jacobian: Floats, error: Floats) -> Floats:
         """Return the damped least-squares step (A,) of dofs; dofs that it would press against a limit stay."""
-        arm, free = self.arm.model, np.ones(len(q))
-        weights = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
-        wanted = weights * error
+        J, wanted = _WEIGHTS[:, None] * jacobian, _WEIGHTS * error
+        pull = J.T @ wanted
+        J = J * ~((q <= self.arm.model.lower) & (pull < 0) | (q >= self.arm.model.upper) & (pull > 0))
         damping = DAMPING * (1e-3 + min(float(wanted @ wanted), 1.0))
-        step = free
-        for _ in range(2):
-            J = weights[:, None] * jacobian * free
-            step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), wanted)
-            pressed = ((q <= arm.lower) & (step < 0)) | ((q >= arm.upper) & (step > 0))
-            if not pressed.any():
-                break
-            free = np.where(pressed, 0.0, free)
-        return step * free * min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-9))
+        step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), wanted)
+        return np.asarray(step * min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-9)))
 
     def _collision(self, joined: list[Floats], ways: list[Path], row: int) -> str:
         """Return the first pair of the arm and another body that collides on the trajectory; else an empty text."""

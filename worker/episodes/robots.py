@@ -48,7 +48,8 @@ def adapter_pose(hand: HandModel) -> Floats:
     z is the palm's approach direction; with a forearm, z is the direction from its far end to the palm. The rear of the
     palm or forearm is `ADAPTER_M` before the flange, centred."""
     if hand.mounting is None:
-        out, corners = hand.palm.approach, np.concatenate([p.vertices for p in hand.pieces if p.body == 0])
+        palm = [p.vertices for p in hand.pieces if p.body == 0] or [hand.palm.centre[None]]
+        out, corners = hand.palm.approach, np.concatenate(palm)
     else:
         poses = _rest_poses(hand.mounting)
         corners = np.concatenate([apply(poses[p.body], p.vertices) for p in hand.mounting.pieces])
@@ -72,14 +73,13 @@ def carry_mounting(arm: Arm, hand: HandModel) -> Arm:
     if hand.mounting is None:
         return arm
     poses = compose(compose(arm.mount_pose, arm.hand_pose), _rest_poses(hand.mounting))
-    pieces = []
+    pieces = list(arm.model.pieces)
     for piece in hand.mounting.pieces:
-        at = poses[piece.body]
-        moved = {"pose": compose(at, piece.pose), "vertices": apply(at, piece.vertices)}
-        pieces.append(replace(piece, body=arm.mount_body, **moved))
+        pose, vertices = compose(poses[piece.body], piece.pose), apply(poses[piece.body], piece.vertices)
+        pieces.append(replace(piece, body=arm.mount_body, pose=pose, vertices=vertices))
     masses = np.array(arm.model.masses)
     masses[arm.mount_body] += hand.mounting.masses[1:].sum()  # body 0 is the hand's root
-    return replace(arm, model=replace(arm.model, pieces=(*arm.model.pieces, *pieces), masses=masses))
+    return replace(arm, model=replace(arm.model, pieces=tuple(pieces), masses=masses))
 
 
 def base_pose(arm: Arm) -> Floats:

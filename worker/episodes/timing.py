@@ -38,7 +38,8 @@ class MotionLimits:
         carrier = np.array([FLYING_VELOCITY, FLYING_ACCELERATION])
         if robot.arm is not None:
             carrier = _dof_limits(robot.arm.model, ARM_ACCELERATION)
-        return cls(*np.concatenate([carrier, _dof_limits(robot.hand, FINGER_ACCELERATION)], axis=1), robot.arm is None)
+        velocity, acceleration = np.hstack([carrier, _dof_limits(robot.hand, FINGER_ACCELERATION)])
+        return cls(velocity, acceleration, robot.arm is None)
 
     def rates(self, differences: Floats) -> Floats:
         """Return (M, L) amounts of change, in the order of the limits, for differences of states (M, D).
