@@ -164,21 +164,18 @@ class _Asset:
             curve.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(curve, 0))
             at = group.GetPath().AppendChild(f"grasp_{name.rpartition('_')[2]}")
             curve.GetPrim().CreateRelationship("graspd:frame").SetTargets([at])
-            frame = self._add_frame(at, parts["grasp"].hand_pose[row])
+            # The frame of the root link at the grasp [m], without scale.
+            matrix = pose_to_matrix(parts["grasp"].hand_pose[row])
+            matrix[:3, 3] /= self.metres
+            frame = UsdGeom.Xform.Define(self.stage, at)
+            frame.AddTransformOp().Set(Gf.Matrix4d((self.to_root @ matrix).T))
+            frame = frame.GetPrim()
             frame.CreateAttribute("graspd:row", kinds.Int).Set(row)
             frame.CreateAttribute("graspd:epsilon", kinds.Double).Set(float(epsilon[row]))
             frame.CreateAttribute("graspd:jointNames", kinds.StringArray).Set(list(hand.joint_names))
             for key, part in parts.items():
                 joints = frame.CreateAttribute(f"graspd:{key}:jointPositions", kinds.DoubleArray)
                 joints.Set(part.joint_positions[row].tolist())
-
-    def _add_frame(self, path: Any, pose: Floats) -> Any:
-        """Add the frame of the hand's root link at a pose (7,) in the object frame [m], without scale."""
-        matrix = pose_to_matrix(pose)
-        matrix[:3, 3] /= self.metres
-        frame = UsdGeom.Xform.Define(self.stage, path)
-        frame.AddTransformOp().Set(Gf.Matrix4d((self.to_root @ matrix).T))
-        return frame.GetPrim()
 
     def add_physics(self, case: Case, written: ExportSummary) -> None:
         """Add a rigid body, colliders, mass and a physics material where the object has none."""

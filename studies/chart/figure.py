@@ -120,19 +120,8 @@ def draw_panel(
             f"{axis}_bar": error_bar_ends(row, key) for axis, key in (("x", x), ("y", y)) if not (none and axis == "x")
         }
         labels.append(Label(axes, at, row[y], words, colour, **({"x_bar": (0.45 * at, at)} if none else {}), **ends))
-    _set_logarithmic(axes, [label.x * (0.5 if "0 of" in label.text else 1.0) for label in labels])
-    top = max([row[f"{y}_high"] for row in rows] or [1.0])
-    axes.set_ylim(-0.09 * top, 1.08 * top)
-    plain_axes(axes)
-    return labels
-
-
-def error_bar_ends(row: Row, key: str) -> tuple[float, float] | None:
-    return (row[f"{key}_low"], row[f"{key}_high"]) if f"{key}_low" in row else None
-
-
-def _set_logarithmic(axes: Any, values: Sequence[float]) -> None:
-    """Set a logarithmic axis of at least one decade, with plain numbers and space for labels on the right."""
+    # The axis has at least one decade, plain numbers, and space for labels on the right.
+    values = [label.x * (0.5 if "0 of" in label.text else 1.0) for label in labels]
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
@@ -143,6 +132,14 @@ def _set_logarithmic(axes: Any, values: Sequence[float]) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 1e3 * low else (1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
+    top = max([row[f"{y}_high"] for row in rows] or [1.0])
+    axes.set_ylim(-0.09 * top, 1.08 * top)
+    plain_axes(axes)
+    return labels
+
+
+def error_bar_ends(row: Row, key: str) -> tuple[float, float] | None:
+    return (row[f"{key}_low"], row[f"{key}_high"]) if f"{key}_low" in row else None
 
 
 def error_bar(row: Row, key: str) -> list[list[float]]:
