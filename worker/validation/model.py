@@ -304,16 +304,10 @@ def _add_mass_and_geoms(spec: Any, body: Any, hand: HandModel, b: int, contact: 
 
 def add_shape(spec: Any, geom: Any, piece: ConvexPiece, name: str) -> None:
     """Set a geom to the shape of a convex piece, in its body's frame."""
-    kinds = {
-        "box": mujoco.mjtGeom.mjGEOM_BOX,
-        "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-        "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-        "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    }
     if piece.kind == "hull":
         add_mesh(spec, geom, piece.vertices, name)
         return
-    geom.type = kinds[piece.kind]
+    geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{piece.kind.upper()}")
     geom.pos, geom.quat = piece.pose[:3], piece.pose[3:]
     if piece.kind == "box":
         geom.size = np.array(piece.size) / 2
