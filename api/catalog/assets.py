@@ -3,12 +3,12 @@
 import io
 import json
 import logging
-from collections.abc import Collection, Mapping, MutableMapping
+from collections.abc import Mapping, MutableMapping
 from dataclasses import replace
 from typing import Final
 
-from graspd.api.access.auth import caller_id, project_scope, require_ownership
-from graspd.service.index.views import AssetView, Page
+from graspd.api.access.auth import InScope, caller_id, project_scope, require_ownership
+from graspd.service.index.views import AssetView
 from graspd.service.model import names
 from graspd.service.model.digests import digest_files
 from graspd.service.model.errors import ConflictError, DamagedError, LimitError, NotFoundError
@@ -40,18 +40,9 @@ class Assets:
     def __init__(self, services: Services) -> None:
         self._services = services
 
-    def page(
-        self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None, refused: bool = False
-    ) -> Page[AssetView]:
-        scope = project_scope()
-        return self._services.index.assets.page(kind, limit=limit, cursor=cursor, refused=refused, scope=scope)
-
-    def get(self, kind: AssetKind, name: str) -> AssetView:
-        return self._services.index.assets.get(kind, name, scope=project_scope())
-
-    def datasets_of(self, digests: Collection[str]) -> dict[str, list[str]]:
-        """Return the names of the datasets that use each hand or object."""
-        return self._services.index.datasets.users_of(digests, scope=project_scope())
+    page = InScope(lambda index: index.assets.page)
+    get = InScope(lambda index: index.assets.get)
+    datasets_of = InScope(lambda index: index.datasets.users_of)
 
     def files(self, asset: AssetView) -> Mapping[str, bytes]:
         return library.load_asset_files(self._services.store, asset.kind, asset.digest)

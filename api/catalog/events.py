@@ -13,7 +13,15 @@ from anyio.to_thread import run_sync
 from fastapi import Request
 from fastapi.sse import ServerSentEvent
 
-from graspd.api.access.auth import caller, caller_id, is_still_authorized, may_change, project_scope, require_ownership
+from graspd.api.access.auth import (
+    InScope,
+    caller,
+    caller_id,
+    is_still_authorized,
+    may_change,
+    project_scope,
+    require_ownership,
+)
 from graspd.api.access.keys import Scope
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.catalog.overview import Overview
@@ -87,8 +95,7 @@ class Webhooks:
     def __init__(self, services: Services) -> None:
         self._services = services
 
-    def end_events(self, since: int, *, limit: int) -> list[EndView]:
-        return self._services.index.outbox.end_events(since, limit=limit, scope=project_scope())
+    end_events = InScope(lambda index: index.outbox.end_events)
 
     def own_ends(self, since: int, *, limit: int) -> list[tuple[EndView, str]]:
         return self._services.index.outbox.own_ends(caller_id(), since, limit=limit, scope=project_scope())

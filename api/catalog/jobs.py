@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 from pydantic import ValidationError
 
-from graspd.api.access.auth import ForeignResource, caller, caller_id, project_scope, require_ownership
+from graspd.api.access.auth import ForeignResource, InScope, caller, caller_id, project_scope, require_ownership
 from graspd.api.access.quotas import Idempotency, Quotas
 from graspd.api.catalog.grasps import Grasps
 from graspd.api.models import Job, JobDetail, MeanMetrics, Shard, StageStatus, stage_state
@@ -77,8 +77,7 @@ class Shards:
         """Yield bytes of the file in chunks; DamagedShard if they changed since the check of the file."""
         return self._checked.stream(shard.key, shard.sha256, start, length)
 
-    def job_of(self, shard_id: str) -> str | None:
-        return self._services.index.shards.job_of(shard_id, scope=project_scope())
+    job_of = InScope(lambda index: index.shards.job_of)
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
         return self._services.index.shards.assets_of(ids)

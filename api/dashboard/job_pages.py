@@ -40,7 +40,6 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
     return render(
         request,
         "job.html",
-        page="/jobs",
         events="" if job.state.is_final else f"/v1/jobs/{job.id}/events",
         refresh_s=0 if job.state.is_final else 3,
         job=job,
@@ -74,7 +73,6 @@ def task_page(request: Request, job_id: str, task_id: str, jobs: JobsOf) -> HTML
     return render(
         request,
         "task.html",
-        page="/jobs",
         events="" if ended else f"/v1/jobs/{job.id}/events",
         refresh_s=0 if ended else 3,
         job=job,

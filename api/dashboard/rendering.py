@@ -53,8 +53,12 @@ def environment() -> Environment:
 
 
 def render(request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
-    """Render a page; `page` is its navigation entry, `events` its update stream, `poll_s` an interval [s]."""
-    defaults = {"page": "", "events": "", "refresh_s": 0, "poll_s": 0, "health": request.app.state.overview.health()}
+    """Render a page; `page` is its navigation entry, by default the first part of its path.
+
+    `events` is its update stream, `poll_s` an interval [s].
+    """
+    page = f"/{request.url.path.split('/')[1]}"
+    defaults = {"page": page, "events": "", "refresh_s": 0, "poll_s": 0, "health": request.app.state.overview.health()}
     context = defaults | context
     may_read = is_allowed(request, Scope.READ)
     has_bell = may_read and context["health"] is not None and context["health"].parts["index"].latency_ms is not None
@@ -106,4 +110,4 @@ def base_url(request: Request) -> str:
 def problem_page(request: Request, problem: dict[str, Any]) -> Response:
     if problem["status"] == 401:
         return RedirectResponse("/login", status_code=303)
-    return render(request, "problem.html", status=problem["status"], problem=problem, health=None)
+    return render(request, "problem.html", status=problem["status"], page="", problem=problem, health=None)
