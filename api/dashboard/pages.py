@@ -268,15 +268,8 @@ def _redirect_to_deletions(id: str) -> RedirectResponse:
 
 
 routers: Final = (
-    router,
-    job_list.search_router,
-    job_list.router,
-    job_pages.router,
-    grasp_pages.router,
-    asset_pages.router,
-    dataset_pages.router,
-    dataset_pages.comparison_router,
-    forms.router,
+    *(router, job_list.search_router, job_list.router, job_pages.router, grasp_pages.router, asset_pages.router),
+    *(dataset_pages.router, dataset_pages.comparison_router, forms.router),
 )
 
 

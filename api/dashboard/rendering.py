@@ -17,17 +17,9 @@ from graspd.service.model.version import PACKAGE_VERSION
 
 _HERE: Final = Path(__file__).parent
 STATIC: Final = _HERE / "static"
-NAVIGATION: Final = (
-    ("/", "Home"),
-    ("/jobs", "Jobs"),
-    ("/datasets", "Datasets"),
-    ("/grasps", "Grasps"),
-    ("/hands", "Hands"),
-    ("/objects", "Objects"),
-    ("/workers", "Workers"),
-    ("/usage", "Usage"),
-    ("/engine", "Engine"),
-)
+#: Pages with keyboard shortcuts, their first letters; then all pages of the navigation.
+_WITH_KEYS: Final = ("jobs", "datasets", "grasps", "hands", "objects", "workers")
+NAVIGATION: Final = (("/", "Home"), *((f"/{name}", name.capitalize()) for name in (*_WITH_KEYS, "usage", "engine")))
 #: Cookie with a message for the next page.
 _TOAST: Final = "graspd_toast"
 #: Parameters of pages that the API does not have.
@@ -36,7 +28,7 @@ _NO_FILTERS: Final = ("view", "cursor", "done")
 SEEN: Final = "graspd_seen"
 MOST_UNREAD: Final = 100
 #: Keyboard shortcuts of pages.
-KEYS: Final = {f"/{page}": page[0] for page in ("jobs", "datasets", "grasps", "hands", "objects", "workers")}
+KEYS: Final = {f"/{page}": page[0] for page in _WITH_KEYS}
 
 
 def environment() -> Environment:

@@ -74,22 +74,9 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
 )
 #: Folders in the order of a scan, which stores its position.
 FOLDERS: Final = (
-    names.SHARDS,
-    names.ASSETS,
-    names.JOBS,
-    names.TASKS,
-    names.DATASETS,
-    names.OBJECT_SETS,
-    names.DELETIONS,
-    names.RELEASED,
-    names.WEBHOOKS,
-    names.TAGS,
-    CHARTS,
-    IN_SCENES,
-    STABILITY,
-    names.MARKS,
-    names.SERVICE,
-    names.REMOVED,
+    *(names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS, names.DELETIONS),
+    *(names.RELEASED, names.WEBHOOKS, names.TAGS, CHARTS, IN_SCENES, STABILITY),
+    *(names.MARKS, names.SERVICE, names.REMOVED),
 )
 _SEALED: Final = (".json", ".zip", ".npz", ".glb")
 _SHARD: Final = re.compile(r"shards/(base|scene|views)/([0-9a-f]{32})\.(h5|json)")
