@@ -25,6 +25,8 @@ from graspd.service.store.asset_summary import hand_line, self_test_line
 app = CommandGroup(no_args_is_help=True)
 
 JobArgument = Annotated[str, typer.Argument(help="Job id, or a prefix of it.")]
+WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")]
+AssetArgument = Annotated[str, typer.Argument(help="Name or digest of the asset.")]
 
 
 @app.command(epilog="graspd submit --hand allegro --object mug.stl --grasps 320 --scenes 2 --views 3 --wait")
@@ -33,7 +35,7 @@ def submit(
     hand: Annotated[str, typer.Option(help="Name of a hand, or a URDF or ZIP to upload.")],
     object: Annotated[str, typer.Option(help="Name of an object, or a mesh file to upload.")],
     options: dict[str, Any],
-    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
+    wait: WaitOption = False,
     url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
@@ -119,12 +121,7 @@ def restore_job(
 
 
 @app.command(epilog="graspd retry 3f2a --wait")
-def retry(
-    job_id: JobArgument,
-    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
-    url: reports.UrlOption = None,
-    json: JsonFlag = False,
-) -> None:
+def retry(job_id: JobArgument, wait: WaitOption = False, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
     """Run failed and cancelled tasks of a job again; existing results are reused."""
     with reports.open_client(url) as client:
         job = client.retry(_full_id(client, job_id))
@@ -192,10 +189,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         epilog=f"graspd {kind.value}s delete my_{kind.value}",
     )
     def delete_asset(
-        name: Annotated[str, typer.Argument(help="Name or digest of the asset.")],
-        yes: reports.YesOption = False,
-        url: reports.UrlOption = None,
-        json: JsonFlag = False,
+        name: AssetArgument, yes: reports.YesOption = False, url: reports.UrlOption = None, json: JsonFlag = False
     ) -> None:
         with reports.open_client(url) as client:
             client.asset(kind, name)
@@ -208,11 +202,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         help=f"Restore a deleted {kind.value} within the grace time.",
         epilog=f"graspd {kind.value}s restore my_{kind.value}",
     )
-    def restore_asset(
-        name: Annotated[str, typer.Argument(help="Name or digest of the asset.")],
-        url: reports.UrlOption = None,
-        json: JsonFlag = False,
-    ) -> None:
+    def restore_asset(name: AssetArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
         reports.restore(url, kind.value, name, json=json)
 
     return group

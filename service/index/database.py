@@ -14,7 +14,8 @@ import sqlite3
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -57,7 +58,10 @@ class Database:
         self._url = url
         self._anew = anew
         self.was = ""
-        self._file = _sqlite_file(url)
+        with convert_url_errors():
+            parsed = sa.make_url(url)
+            is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
+        self._file = SqliteFile(Path(str(parsed.database))) if is_file else None
         self._write_lock = threading.Lock()
         self._opening = threading.Lock()
         self._identity: Identity = None
@@ -185,14 +189,6 @@ def rows_in(
 ) -> Iterator[Any]:
     for some in chunks(list(wanted)):
         yield from connection.execute(query.where(column.in_(some)))
-
-
-def _sqlite_file(url: str | sa.URL) -> SqliteFile | None:
-    """Return the file of an SQLite index, None if it has no file; InputError for an invalid URL."""
-    with convert_url_errors():
-        parsed = sa.make_url(url)
-        is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
-    return SqliteFile(Path(str(parsed.database))) if is_file else None
 
 
 def _engine(url: str | sa.URL) -> sa.Engine:
@@ -479,3 +475,70 @@ def decode_cursor(cursor: str, *kinds: type | tuple[type, ...]) -> tuple[Any, ..
 
 def page_size(limit: int) -> int:
     return min(limit, MAX_LIMIT)
+
+
+#: Time to wait for a writer before the condition of an index is unknown [s].
+_TIMEOUT_S: Final = 5.0
+
+
+@dataclass(frozen=True)
+class IndexCondition:
+    """Kind, revision, connections and write permission of an index, read without changes."""
+
+    kind: str
+    revision: str
+    """Revision of the tables; "" before the first open."""
+    newest: str
+    connections: tuple[int, int] = (0, 0)
+    """Used and allowed connections; zeros if unknown."""
+    may_write: bool = True
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether opening the index would change nothing."""
+        return bool(self.revision) and self.revision == self.newest
+
+
+def read_condition(url: str | sa.URL) -> IndexCondition | None:
+    """Return the condition of an index, None without a file; errors of `Database`, or IndexDamaged."""
+    with convert_url_errors():
+        if (parsed := sa.make_url(url)).get_backend_name() == "sqlite":
+            return _file_condition(Path(str(parsed.database)))
+        return _postgres_condition(url)
+
+
+def _file_condition(path: Path) -> IndexCondition | None:
+    if not path.exists():
+        return None
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=_TIMEOUT_S)) as connection:
+            if (result := connection.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
+                raise IndexDamaged(f"the index {path} is damaged: {result}")
+            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            query = f"SELECT version_num FROM {REVISION_TABLE}"
+            rows = connection.execute(query).fetchall() if REVISION_TABLE in tables else []
+    except sqlite3.DatabaseError as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+            raise IndexDamaged(f"the index {path} is damaged: {error}") from None
+        raise IndexUnavailable(f"the index {path} cannot be read: {error}") from None
+    return IndexCondition(f"SQLite {sqlite3.sqlite_version}", rows[0][0] if rows else "", REVISION)
+
+
+def _postgres_condition(url: str | sa.URL) -> IndexCondition:
+    engine = connect_postgres(url)
+    try:
+        with convert_errors(), engine.connect() as connection:
+
+            def ask(question: str) -> str:
+                return str(connection.scalar(sa.text(question)))
+
+            return IndexCondition(
+                f"PostgreSQL {ask('SHOW server_version')}",
+                revision_of(connection),
+                REVISION,
+                (int(ask("SELECT count(*) FROM pg_stat_activity")), int(ask("SHOW max_connections"))),
+                ask("SELECT pg_is_in_recovery()") == "False"
+                and ask("SELECT has_schema_privilege(current_schema(), 'CREATE')") == "True",
+            )
+    finally:
+        engine.dispose()

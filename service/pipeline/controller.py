@@ -226,7 +226,11 @@ class Controller:
         if made is None or made.left_out or self._is_stale():
             self._rebuild_index()
         else:
-            self._index_assets()
+            for kind, digest in stored_assets(self._services.store):
+                try:
+                    self._indexer.index_asset(kind, digest)
+                except DamagedError as error:
+                    log.warning("%s", error)
         self._started = True
 
     def _is_stale(self) -> bool:
@@ -243,13 +247,6 @@ class Controller:
     def _rebuild_index(self) -> None:
         log.warning("the index may lack records of the store: it is rebuilt from the store")
         rebuild(self._services.index, self._services.store, progress=lambda *_: self._alive.touch())
-
-    def _index_assets(self) -> None:
-        for kind, digest in stored_assets(self._services.store):
-            try:
-                self._indexer.index_asset(kind, digest)
-            except DamagedError as error:
-                log.warning("%s", error)
 
     def _index_events(self, wait_s: float) -> None:
         """Apply new events; events that need an unavailable store wait in the backlog."""

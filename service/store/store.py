@@ -231,16 +231,12 @@ def _put_local(root: Path, key: str, data: IO[bytes]) -> bool:
     finally:
         staged.unlink(missing_ok=True)
     for folder in {path.parent, *(folder.parent for folder in made)}:
-        _sync_folder(folder)
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
     return True
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 @contextmanager

@@ -419,7 +419,7 @@ def test_a_model_of_an_older_version_says_the_mend(http: TestClient, services: S
 
 
 def test_damaged_files_or_a_long_description_are_refused(http: TestClient, services: Services, monkeypatch) -> None:
-    monkeypatch.setattr("graspd.api.catalog.assets.MAX_BYTES", 100)
+    monkeypatch.setattr("graspd.service.store.descriptions.MAX_BYTES", 100)
     answer = corrected(http, SAID)
     assert answer.status_code == 413 and "give fewer corrections" in answer.json()["detail"]
     key = names.asset_key(AssetKind.HAND, http.get("/v1/hands/barrett").json()["digest"], "files.zip")
