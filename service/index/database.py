@@ -18,7 +18,7 @@ from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypedDict, TypeVar, Unpack
 
 import sqlalchemy as sa
 from pydantic_core import from_json
@@ -438,22 +438,29 @@ MAX_LIMIT: Final = 200
 _MOST: Final = 2**63
 
 
+class Paging(TypedDict, total=False):
+    """Requested part of a list: maximum number of items (default: 50), and cursor of the page (None: the first)."""
+
+    limit: int
+    cursor: str | None
+
+
 def page_rows(
     connection: sa.Connection,
     query: sa.Select[Any],
     *key: sa.ColumnElement[Any],
-    limit: int,
-    cursor: str | None,
     descending: bool = True,
+    **part: Unpack[Paging],
 ) -> tuple[Sequence[sa.RowMapping], str | None]:
     """Return the rows of a page, ordered by `key`, and the next cursor; InputError as in `decode_cursor`."""
-    size = page_size(limit)
-    if cursor is not None:
-        start = decode_cursor(cursor, *(part.type.python_type for part in key))
+    size = page_size(part.get("limit", 50))
+    if (cursor := part.get("cursor")) is not None:
+        start = decode_cursor(cursor, *(column.type.python_type for column in key))
         query = query.where(sa.tuple_(*key) < start if descending else sa.tuple_(*key) > start)
-    query = query.order_by(*(part.desc() if descending else part for part in key)).limit(size + 1)
+    query = query.order_by(*(column.desc() if descending else column for column in key)).limit(size + 1)
     rows = connection.execute(query).mappings().all()
-    return rows[:size], encode_cursor(*(rows[size - 1][str(part.key)] for part in key)) if len(rows) > size else None
+    last = rows[size - 1] if len(rows) > size else None
+    return rows[:size], encode_cursor(*(last[str(column.key)] for column in key)) if last is not None else None
 
 
 def encode_cursor(*key: Any) -> str:

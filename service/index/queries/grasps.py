@@ -12,7 +12,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Unpack
 
 from pydantic import Field
 from sqlalchemy import ColumnElement, Connection, Float, Select, String, Subquery, and_, func, not_, or_, select, tuple_
@@ -48,14 +48,9 @@ _BEST_FIRST = GraspSort()
 
 class Grasps(database.IndexPart):
     def page(
-        self,
-        where: GraspFilter | None = None,
-        *,
-        sort: GraspSort = _BEST_FIRST,
-        limit: int = 50,
-        cursor: str | None = None,
+        self, where: GraspFilter | None = None, *, sort: GraspSort = _BEST_FIRST, **part: Unpack[database.Paging]
     ) -> Page[GraspView]:
-        size = database.page_size(limit)
+        size, cursor = database.page_size(part.get("limit", 50)), part.get("cursor")
         start = None if cursor is None else database.decode_cursor(cursor, (float, int, str, type(None)), str, int)
         with self.database.read_transaction() as connection:
             rows = search(connection, where, sort, size + 1, start)

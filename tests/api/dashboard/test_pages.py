@@ -216,7 +216,7 @@ def calls(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], 
         return httpx.Response(found.status_code, content=found.content)
 
     client = Client(BASE_URL, transport=httpx.MockTransport(answer))
-    for module in ("graspd.remote", "graspd.client.commands"):
+    for module in ("graspd.remote", "graspd.client.reports"):
         monkeypatch.setattr(f"{module}.open_client", lambda url, key=None: client)
     monkeypatch.setattr(client, "close", lambda: None)
 
