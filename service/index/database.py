@@ -439,7 +439,7 @@ _MOST: Final = 2**63
 
 
 class Paging(TypedDict, total=False):
-    """Requested part of a list: maximum number of items (default: 50), and cursor of the page (None: the first)."""
+    """Requested part of a list: at most `limit` items (default: 50) from `cursor` (None: the first page)."""
 
     limit: int
     cursor: str | None

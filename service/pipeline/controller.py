@@ -148,7 +148,10 @@ class Controller:
     def run_round(self, *, wait_s: float = 0.0) -> None:
         """Index new events, then run due duties; BusyError if another service has taken over the store."""
         self._identify()
-        self._ensure_index()
+        if not self._started:
+            self._start()
+        elif self._services.index.notes.completeness() is None or self._is_stale():
+            self._rebuild_index()
         away: list[UnavailableError] = []
         with _log_failures(away):
             self._index_events(0.0 if self._has_plans else min(wait_s, _PROGRESS_EVERY_S))
@@ -207,13 +210,6 @@ class Controller:
         # A worker that ends is unregistered shortly before its event arrives: only a longer silence means a loss.
         lost, forgotten = timestamp(self._services.settings.lease_s), timestamp(_FORGET_WORKERS_AFTER_S)
         self._services.index.live.set_workers(present, lost_before=lost, forget_before=forgotten)
-
-    def _ensure_index(self) -> None:
-        """Ensure that the index is complete before events are applied; it may be lost at any time."""
-        if not self._started:
-            self._start()
-        elif self._services.index.notes.completeness() is None or self._is_stale():
-            self._rebuild_index()
 
     def _start(self) -> None:
         publish_builtins(self._services.store)

@@ -80,6 +80,7 @@ def test_a_failed_job_says_why_and_offers_a_retry(http: TestClient, services: Se
     fail(services, record := add_job(services), "<b>not</b> watertight")
     page = http.get(f"/jobs/{record.id}").text
     assert "&lt;b&gt;not&lt;/b&gt; watertight" in page and f'action="/jobs/{record.id}/retry"' in page
+    assert "&lt;b&gt;not&lt;/b&gt; watertight" in http.get("/jobs?state=failed").text
 
 
 def test_a_thumbnail_is_the_picture_of_the_shard(http: TestClient, services: Services) -> None:
