@@ -43,15 +43,15 @@ def export_training(source: str, format_: str, wishes: TrainingExportOptions, fo
     shards = open_source(source)
     lots = list(export_parts(shards, format_, wishes))
     out = split_objects(lots, wishes.held_out)
-    from graspd.exchange import dexgraspnet2, dexlearn, graspgen, huggingface, lerobot
+    from graspd.exchange import dexlearn, graspgen, huggingface, lerobot
 
     if format_ == "graspgen":
         return graspgen.write(lots, folder, out)
-    columns = COLUMNS if format_ in ("dexlearn", "dexgraspnet2") else (*COLUMNS, "image/rgb")
+    columns = COLUMNS if format_ == "dexlearn" else (*COLUMNS, "image/rgb")
     pictures = Pictures(shards, columns, grasp_quality=(), valid=not wishes.every, unvalidated=wishes.unvalidated)
     if format_ == "lerobot":
         return lerobot.write(lots, pictures, folder, out)
-    writer = {"dexlearn": dexlearn.write, "dexgraspnet2": dexgraspnet2.write, "huggingface": huggingface.write}[format_]
+    writer = dexlearn.write if format_ == "dexlearn" else huggingface.write
     return writer(lots, pictures, folder, out, parse_depth_noise(wishes.noise or None))
 
 
