@@ -378,6 +378,8 @@ class JobOptions(Model):
             raise ValueError("payload is measured by a validator: choose one")
         if self.shake:
             raise ValueError("shake is simulated by a validator: choose one")
+        if self.has_episodes:
+            raise ValueError("episodes execute valid grasps: choose a validator")
 
     @property
     def requirements(self) -> dict[str, Any]:

@@ -213,6 +213,7 @@ def test_a_document_comes_back_and_fingertips_may_touch_unless_it_says_otherwise
         ({"scene": {"supports": [PLANE], "target": [0, 0, 0, 1, 0, 0, 0]}, "faces": "all"}, "lies on one face"),
         ({"faces": "all"}, "lies on no face"),
         ({"episodes": "flying"}, "free grasps have no episodes"),
+        ({"scene": "table", "episodes": "flying", "validation": "none"}, "episodes execute valid grasps"),
         ({"scene": "table", "film": ["scene"]}, "film shows episodes"),
         ({"touch": 1}, "no supports to touch"),
         ({"scene": "table", "touch": -1.5}, "greater than or equal to -1"),
