@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import ConflictError, InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats
+from graspd.service.store import validity
 from graspd.service.store.columns import CAMERAS, SCHEMAS, Attribute
 from graspd.service.store.shards import Shard
 from graspd.worker.episodes.episode import Episode, EpisodeOutcome, Robot
@@ -54,6 +55,7 @@ class EpisodeOptions:
     fps: float = FPS
     seed: int = 0
     limit: int = 0  # number of valid grasps, from the first; 0: all
+    empty: bool = False  # whether a shard without valid grasps has an empty result
 
 
 def record_episodes(
@@ -75,17 +77,19 @@ def record_episodes(
         raise InputError(
             f"{base.path or 'the shard'} has free grasps; episodes need a scene: graspd synth --scene table"
         )
-    rows = np.flatnonzero(select_grasps(base)[0])[: options.limit or None]
+    valid = validity.valid_mask(base.arrays) if options.empty else select_grasps(base)[0]
+    rows = np.flatnonzero(valid)[: options.limit or None]
     robot = read_robot(hand, options.arm, mount=options.mount, mount_pose=options.mount_pose, base=options.base)
-    tool = ToolFrame(hand.root_link, IDENTITY_POSE)
-    grasps = GraspSet.from_columns(base.arrays).take(rows)
-    found = build_executions(hand, obj, grasps, rows=rows, placed=placed.take(rows), tool=tool, quality={})
-    episodes = execute_grasps(robot, found, pieces or decompose(obj), options, film=film, run=run)
+    episodes: list[Episode] = []
+    if len(rows):
+        tool, grasps = ToolFrame(hand.root_link, IDENTITY_POSE), GraspSet.from_columns(base.arrays).take(rows)
+        found = build_executions(hand, obj, grasps, rows=rows, placed=placed.take(rows), tool=tool, quality={})
+        episodes = execute_grasps(robot, found, pieces or decompose(obj), options, film=film, run=run)
     inherited = {name: base.attributes[name] for name in (*INHERITED, *_INHERITED) if name in base.attributes}
     attributes: dict[str, Attribute] = inherited | source_attributes(base) | _robot_attributes(robot, options)
     attributes |= {"seed": options.seed, "fps": options.fps, "device": "cpu"}
-    columns = episode_columns(episodes, placed) | {
-        path: np.asarray(base.arrays[path])[found.rows]
+    columns = episode_columns(episodes, robot, placed) | {
+        path: np.asarray(base.arrays[path])[rows]
         for path in SCHEMAS["episodes"]
         if path.startswith("quality/") and path in base.arrays
     }
@@ -118,9 +122,7 @@ def execute_grasps(
             episode = simulation.execute(motion, row, shard_row)
             episode = episode if camera is None else replace(episode, videos=camera(episode))
         else:
-            none = np.zeros((0, len(robot.names)))
-            beside = np.zeros((0, len(placed.neighbours), 7))
-            episode = Episode(shard_row, scene, motion, np.zeros(0, np.uint8), none, none, np.zeros((0, 7)), beside)
+            episode = replace(_no_frames(robot, placed), row=shard_row, scene=scene, outcome=motion)
         done.add(1)
         return episode
 
@@ -162,8 +164,14 @@ def robot_of_shard(shard: Shard, hand: HandModel) -> Robot:
     return robot
 
 
-def episode_columns(episodes: list[Episode], placed: PlacedGrasps) -> dict[str, NDArray[Any]]:
+def _no_frames(robot: Robot, placed: PlacedGrasps) -> Episode:
+    none, beside = (np.zeros((0, *shape), np.float32) for shape in ((len(robot.names),), (len(placed.neighbours), 7)))
+    return Episode(0, 0, EpisodeOutcome.NO_TRANSIT, np.zeros(0, np.uint8), none, none, none[:, :7], beside)
+
+
+def episode_columns(episodes: list[Episode], robot: Robot, placed: PlacedGrasps) -> dict[str, NDArray[Any]]:
     """Return the columns of a shard of episodes, except those of the grasps' quality."""
+    none = _no_frames(robot, placed)
     columns: dict[str, NDArray[Any]] = {
         "episode/row": np.array([one.row for one in episodes], np.int32),
         "episode/scene_index": np.array([one.scene for one in episodes], np.int32),
@@ -172,7 +180,7 @@ def episode_columns(episodes: list[Episode], placed: PlacedGrasps) -> dict[str, 
         "scene/object_pose": np.asarray(placed.object_pose),
     }
     for name in _FRAMES if placed.neighbours else _FRAMES[:-1]:
-        columns[f"frame/{name}"] = np.concatenate([getattr(one, name) for one in episodes])
+        columns[f"frame/{name}"] = np.concatenate([getattr(one, name) for one in (none, *episodes)])
     if placed.neighbours:
         columns["scene/neighbour_pose"] = np.asarray(placed.neighbour_pose)
     for camera in CAMERAS:
