@@ -1,6 +1,6 @@
 """Episodes: motions of an arm with a hand, or of a flying hand, executed with one grasp each."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final
 
@@ -38,7 +38,7 @@ class Robot:
 
     hand: HandModel
     arm: Arm | None = None
-    base: Floats = IDENTITY_POSE  # (7,) pose of the arm's root link in the scene
+    base: Floats = field(default_factory=IDENTITY_POSE.copy)  # (7,) pose of the arm's root link in the scene
 
     @property
     def names(self) -> tuple[str, ...]:
