@@ -80,7 +80,7 @@ def check_columns(kind: ShardKind, arrays: Arrays) -> dict[str, int]:
             raise InputError(f"{path} has {array.ndim} axes; the schema says ({', '.join(letters)})")
         for letter, length in zip(letters, array.shape, strict=True):
             expected = int(letter) if letter.isdigit() else lengths.setdefault(letter, length)
-            if expected != length:
+            if expected != length and letter != "*":
                 raise InputError(f"{path}: axis {letter} has length {length}, expected {expected}")
     return lengths
 
