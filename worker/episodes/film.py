@@ -22,6 +22,7 @@ from graspd.service.model.transforms import (
     Floats,
     apply,
     compose,
+    invert,
     pose_from_matrix,
     quat_from_axis_angle,
     quat_rotate,
@@ -218,14 +219,14 @@ class EpisodeRenderer:
 
     def _views(self, poses: Floats, angles: Sequence[float], keys: Any, still: Sequence[bool] | None = None) -> Any:
         """Return cameras (C, 7) with vertical fields of view [rad] for the samples of `keys`."""
-        views = np.zeros(len(poses), raster.View.numpy_dtype())
-        views["place"], views["focal"] = _quat_last(poses), 0.5 * keys.shape[1] / np.tan(0.5 * np.asarray(angles))
+        views = _view_structs(poses)
+        views["focal"] = 0.5 * keys.shape[1] / np.tan(0.5 * np.asarray(angles))
         views["still"] = False if still is None else still
         return self._array(views, raster.View)
 
     def _cover(self, views: Any, keys: Any, first_part: int = 0) -> None:
         keys.fill_(raster.NONE)
-        inputs = [self._scene, first_part, views]
+        inputs = [self._scene, len(self._supports), first_part, views]
         wp.launch(raster.cover, (len(views), len(self._part)), inputs, [keys], device=self._device)
 
     def _read(self, keys: Any) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
@@ -242,8 +243,7 @@ class EpisodeRenderer:
         for name in Light.vars:
             setattr(light, name, getattr(lamp, name))
         passes = light_passes(self.options.lights, toward)
-        views = np.zeros(len(passes), raster.View.numpy_dtype())
-        views["place"] = _quat_last(np.stack([_camera_pose(middle + _FAR_M * one.toward, middle) for one in passes]))
+        views = _view_structs(np.stack([_camera_pose(middle + _FAR_M * one.toward, middle) for one in passes]))
         views["parallel"], views["focal"] = True, 0.5 * _MAP / (radius + _SHADOW_M)
         towards = self._array([one.toward for one in passes], wp.vec3f)
         structs = struct_array(passes, exposure.LightPass, self._device)
@@ -333,6 +333,12 @@ def _box(size: Floats) -> Solid:
 
 def _quat_last(poses: Floats) -> NDArray[np.float32]:
     return np.asarray(poses[..., [0, 1, 2, 4, 5, 6, 3]], np.float32)
+
+
+def _view_structs(poses: Floats) -> NDArray[Any]:
+    views = np.zeros(len(poses), raster.View.numpy_dtype())
+    views["place"], views["inverse"] = _quat_last(poses), _quat_last(invert(poses))
+    return views
 
 
 def _direction(azimuth: float, elevation: float) -> Floats:

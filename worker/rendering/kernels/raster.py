@@ -31,6 +31,7 @@ class View:
     """A pinhole camera, or the parallel projection of a shadow map; z points forward."""
 
     place: wp.transformf  # pose in the scene
+    inverse: wp.transformf
     focal: wp.float32  # [samples], for a parallel projection [samples/m]
     parallel: wp.bool
     still: wp.bool  # whether the picture's background was rendered before
@@ -53,21 +54,28 @@ def projected(view: View, width: wp.int32, height: wp.int32, local: wp.vec3f):
 
 
 @wp.kernel
-def cover(scene: Triangles, first_part: wp.int32, view_in: wp.array[View], key_out: wp.array3d[wp.int64]):
-    """Write keys of the nearest faces; parts before `first_part` are omitted."""
+def cover(
+    scene: Triangles, supports: wp.int32, first_part: wp.int32, view_in: wp.array[View], key_out: wp.array3d[wp.int64]
+):
+    """Write keys of the nearest faces; parts before `first_part` are omitted, and back faces of the supports."""
     k, face = wp.tid()
     if scene.part[face] < first_part:
         return
     view = view_in[k]
     height = key_out.shape[1]
     width = key_out.shape[2]
-    inverse = wp.transform_inverse(view.place)
     h = wp.mat33f()
     depth = wp.vec3f()
     for i in range(3):
-        local = wp.transform_point(inverse, scene.point[scene.corner[face, i]])
+        local = wp.transform_point(view.inverse, scene.point[scene.corner[face, i]])
         h[i] = projected(view, width, height, local)
         depth[i] = local[2]
+    n0 = wp.cross(h[1], h[2])
+    n1 = wp.cross(h[2], h[0])
+    n2 = wp.cross(h[0], h[1])
+    side = wp.sign(wp.dot(h[0], n0))
+    if side > 0.0 and scene.part[face] < supports:
+        return
     low = wp.vec2f(1.0e9, 1.0e9)
     high = wp.vec2f(-1.0e9, -1.0e9)
     for i in range(3):
@@ -88,18 +96,13 @@ def cover(scene: Triangles, first_part: wp.int32, view_in: wp.array[View], key_o
     bottom = wp.int32(wp.floor(wp.min(high[1] - 0.5, wp.float32(height - 1))))
     if right < left or bottom < top:
         return
-    n0 = wp.cross(h[1], h[2])
-    n1 = wp.cross(h[2], h[0])
-    n2 = wp.cross(h[0], h[1])
-    # Both sides of a face are visible.
-    side = wp.sign(wp.dot(h[0], n0))
-    n0 = n0 * side
-    n1 = n1 * side
-    n2 = n2 * side
+    across = wp.vec3f(n0[0], n1[0], n2[0]) * side
+    down = wp.vec3f(n0[1], n1[1], n2[1]) * side
+    corner = wp.vec3f(n0[2], n1[2], n2[2]) * side + 0.5 * (across + down)
     for row in range(top, bottom + 1):
+        start = corner + wp.float32(row) * down
         for column in range(left, right + 1):
-            d = wp.vec3f(wp.float32(column) + 0.5, wp.float32(row) + 0.5, 1.0)
-            e = wp.vec3f(wp.dot(n0, d), wp.dot(n1, d), wp.dot(n2, d))
+            e = start + wp.float32(column) * across
             if e[0] >= 0.0 and e[1] >= 0.0 and e[2] >= 0.0:
                 z = wp.dot(e, depth) / (e[0] + e[1] + e[2])
                 if z > _NEAR:
@@ -145,7 +148,7 @@ def is_dark(
     """Check whether a solid is nearer to the light; points outside of the map are lit."""
     texel = 1.0 / view.focal
     # The map's samples differ by their size: the point is moved out of its own surface.
-    local = wp.transform_point(wp.transform_inverse(view.place), point + (normal + toward) * (1.2 * texel))
+    local = wp.transform_point(view.inverse, point + (normal + toward) * (1.2 * texel))
     at = projected(view, key_in.shape[2], key_in.shape[1], local)
     if at[0] < 0.0 or at[1] < 0.0:
         return False
