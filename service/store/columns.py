@@ -70,7 +70,7 @@ PUSH_OUTCOMES: Final = dict(
 _LIFT_OUTCOMES = ("not tested", "lifted", "penetration", "contact on the approach", "lost while closing", "not lifted")
 LIFT_OUTCOMES: Final = dict(enumerate((*_LIFT_OUTCOMES, "rotated", "diverged", "neighbour moved")))
 #: Meanings of `worker.episodes.episode.EpisodeOutcome`; grasps with the last four were not executed.
-_EPISODE_OUTCOMES = ("succeeded", "touched before closing", "not lifted", "dropped", "diverged", "out of reach")
+_EPISODE_OUTCOMES = ("succeeded", "touched", "not lifted", "dropped", "diverged", "out of reach")
 EPISODE_OUTCOMES: Final = dict(enumerate((*_EPISODE_OUTCOMES, "no continuous motion", "collision", "no transit")))
 #: Meanings of the codes of phases, `worker.episodes.episode.PHASES`.
 _PHASES = ("transit", "approach", "shape", "close", "squeeze", "lift", "hold")
@@ -276,8 +276,8 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "arm_digest": RootAttribute("text", "digest of the arm's files", _EPISODES),
     "arm_source": RootAttribute("text", "path from which a local command read the arm; absent: built in", _EPISODES),
     "arm_mount": RootAttribute("text", "link of the arm that carries the hand", _EPISODES),
-    "arm_mount_pose": RootAttribute("text", "JSON: pose of the hand's root link in the frame of this link", _EPISODES),
-    "arm_base": RootAttribute("text", "JSON: pose of the arm's root link in the scene", _EPISODES),
+    "arm_mount_pose": RootAttribute("text", "pose of the hand's root link in the frame of this link", _EPISODES),
+    "arm_base": RootAttribute("text", "pose of the arm's root link in the scene", _EPISODES),
     "cameras": RootAttribute("text", "JSON: width, height, codec and poses of each camera; absent: none", _EPISODES),
 }
 

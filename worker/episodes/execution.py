@@ -116,6 +116,7 @@ def posed_bodies(found: Executions, posture: str, row: int) -> Floats:
 
 
 _SLACK = 1e-2  # tolerance of a quaternion's length around 1
+_EXACT = 1e-12  # error of a unit quaternion by rounding; such a pose is unchanged
 
 
 def parse_pose(text: str, what: str) -> Floats:
@@ -130,7 +131,8 @@ def parse_pose(text: str, what: str) -> Floats:
     length = float(np.linalg.norm(values[3:]))
     if abs(length - 1.0) > _SLACK:
         raise InputError(f"{what}: the quaternion qw qx qy qz has length {length:.3g}; it must be 1")
-    values[3:] /= length
+    if abs(length - 1.0) > _EXACT:
+        values[3:] /= length
     return values
 
 
