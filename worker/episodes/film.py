@@ -3,9 +3,11 @@
 Lights, materials and cameras are random within the ranges below and of `rendering.scene_setup.draw_*`."""
 
 import io
+import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import InputError
 from graspd.service.model.pinhole import pixel_rays
 from graspd.service.model.scene_spec import Box as BoxSupport
-from graspd.service.model.scene_spec import HalfSpace
+from graspd.service.model.scene_spec import HalfSpace, scene_supports
 from graspd.service.model.transforms import (
     IDENTITY_POSE,
     Floats,
@@ -27,9 +29,14 @@ from graspd.service.model.transforms import (
     quat_from_axis_angle,
     quat_rotate,
 )
+from graspd.service.readers.trajectories import scene_spec_of
+from graspd.service.store.columns import Attribute
+from graspd.service.store.shards import Shard
 from graspd.worker.engines import backend
 from graspd.worker.episodes.episode import Episode, Robot
+from graspd.worker.episodes.execution import Executions
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.files.provenance import neighbours_of_shard
 from graspd.worker.hands.primitives import hull
 from graspd.worker.objects.mesh_geometry import corner_normals, to_centred_frame
 from graspd.worker.objects.model import ObjectModel
@@ -87,6 +94,21 @@ class FilmOptions:
     segmentation: bool = False
 
 
+def film_options(cameras: str, size: str = "320x240", channels: str = "", fps: float = 15.0) -> FilmOptions:
+    """Parse lists separated by commas. Raises InputError: a camera, a size or a channel is unknown."""
+    names, kinds = tuple(filter(None, cameras.split(","))), tuple(filter(None, channels.split(",")))
+    if unknown := [*(set(names) - set(VIEWS)), *(set(kinds) - {"depth", "segmentation"})]:
+        raise InputError(f"films have no {unknown[0]!r}; cameras: {', '.join(VIEWS)}; channels: depth, segmentation")
+    found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", size)
+    if found is None or int(found[1]) % 2 or int(found[2]) % 2:
+        raise InputError(f"the size of a film is WIDTHxHEIGHT, two even numbers up to 9998, not {size!r}")
+    if not float(fps).is_integer():
+        raise InputError(f"a film has a whole number of frames per second, not {fps:g}")
+    return FilmOptions(
+        names, int(found[1]), int(found[2]), fps, depth="depth" in kinds, segmentation="segmentation" in kinds
+    )
+
+
 @dataclass(frozen=True)
 class Film:
     """T pictures of an episode by one camera."""
@@ -129,22 +151,16 @@ class EpisodeRenderer:
         labels += [label for label, some in zip((HAND, ARM), parts, strict=False) for _ in some]
         # The last label is that of part -1.
         self._labels = np.array([*[SUPPORT] * len(supports), *labels, BACKDROP], np.uint8)
-        self._place(self._poses(neutral[None], _AWAY[None], np.tile(_AWAY, (1, len(neighbours), 1)))[0])
+        self._place(self._poses(neutral[None], _AWAY[None], np.tile(_AWAY, (1, len(neighbours), 1)), 0.0)[0])
         self._mount = self._find_mount(self._robot.poses(neutral)[0][1][0, 0])
 
-    def film(
-        self,
-        episode: Episode,
-        seed: Sequence[int],
-        neighbour_pose: Floats | None = None,
-        run: ExecutionContext = DEFAULT_CONTEXT,
-    ) -> dict[str, Film]:
-        """Return films of all cameras; `neighbour_pose` (T, M, 7) in the scene.
+    def film(self, episode: Episode, seed: Sequence[int], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Film]:
+        """Return films of all cameras.
         The seed decides lights, materials and cameras. Raises TaskCancelled: `run.cancelled()` returned True."""
         rng, size = np.random.default_rng(seed), (self.options.height, self.options.width)
         looks = [draw_table_look(rng) for _ in self._supports] + [draw_object_look(rng) for _ in self._objects]
         self._scene.material = struct_array([*looks, *self._looks], Material, self._device)
-        poses = self._poses(episode.state, episode.object_pose, neighbour_pose, rng.uniform(0, 2 * np.pi))
+        poses = self._poses(episode.state, episode.object_pose, episode.neighbour_pose, rng.uniform(0, 2 * np.pi))
         sphere = self._motion(episode, poses)
         lights = self._lights(*sphere, rng)
         cameras = self._cameras(episode, poses, *sphere, rng)
@@ -201,14 +217,11 @@ class EpisodeRenderer:
     def _keys(self, count: int, height: int, width: int) -> Any:
         return wp.empty((count, height, width), dtype=wp.int64, device=self._device)
 
-    def _poses(
-        self, state: Floats, object_pose: Floats, neighbour_pose: Floats | None = None, yaw: float = 0.0
-    ) -> Floats:
+    def _poses(self, state: Floats, object_pose: Floats, neighbour_pose: Floats, yaw: float) -> Floats:
         """Return poses (T, P, 7) of all solids; `yaw` turns the table [rad]."""
-        things = [object_pose[:, None], *(() if neighbour_pose is None else (neighbour_pose,))]
-        placed = np.concatenate(things, axis=1)
-        centred = [to_centred_frame(placed[:, k], one.centre) for k, one in enumerate(self._objects)]
-        slabs = np.tile(slab_poses(self._supports, centred[0][0, :3], yaw), (len(placed), 1, 1))
+        placed = [object_pose, *(neighbour_pose[:, m] for m in range(len(self._objects) - 1))]
+        centred = [to_centred_frame(pose, one.centre) for pose, one in zip(placed, self._objects, strict=True)]
+        slabs = np.tile(slab_poses(self._supports, centred[0][0, :3], yaw), (len(state), 1, 1))
         robot = [poses[:, drawn_bodies(model)] for model, poses in self._robot.poses(state)]
         return np.concatenate([slabs, np.stack(centred, axis=1), *robot], axis=1)
 
@@ -276,9 +289,7 @@ class EpisodeRenderer:
             found[name] = np.stack([_camera_pose(one, aim) for one in eyes])
         return found
 
-    def _find_scene_camera(
-        self, poses: Floats, middle: Floats, radius: float, rng: Generator
-    ) -> tuple[Floats, Floats]:
+    def _find_scene_camera(self, poses: Floats, middle: Floats, radius: float, rng: Generator) -> tuple[Floats, Floats]:
         """Return place (3,) and aim (3,); of a few draws, those that show most of the object when it is least visible."""
         draws = []
         for _ in range(_DRAWS):
@@ -381,11 +392,34 @@ def encode(pictures: NDArray[Any], fps: float) -> bytes:
     return buffer.getvalue()
 
 
-def encode_films(films: Mapping[str, Film], fps: float) -> dict[str, bytes]:
-    """Return the videos of an episode: CAMERA, and on demand CAMERA_depth and CAMERA_segmentation."""
-    videos = {}
-    for camera, taken in films.items():
-        for name, pictures in ((camera, taken.rgb), (f"{camera}_depth", taken.depth), (f"{camera}_segmentation", taken.segmentation)):
-            if pictures is not None:
-                videos[name] = encode(pictures, fps)
-    return videos
+def film_maker(
+    base: Shard, options: FilmOptions, seed: int, run: ExecutionContext = DEFAULT_CONTEXT
+) -> Callable[[Robot, Executions], Callable[[Episode], Episode]]:
+    """Return a function that makes a function, for one thread, that adds films to episodes of a base shard's grasps."""
+    spec, beside = scene_spec_of(base), neighbours_of_shard(base, [])
+
+    def make(robot: Robot, found: Executions) -> Callable[[Episode], Episode]:
+        supports = TABLE if spec is None else scene_supports(spec)
+        neighbours = () if beside is None else beside.objects
+        renderer = EpisodeRenderer(robot, found.obj, supports=supports, neighbours=neighbours, options=options)
+
+        def add(episode: Episode) -> Episode:
+            films = renderer.film(episode, (seed, episode.row), run)
+            videos = {}
+            for camera, taken in films.items():
+                pictures = {"": taken.rgb, "_depth": taken.depth, "_segmentation": taken.segmentation}
+                videos |= {camera + kind: encode(one, options.fps) for kind, one in pictures.items() if one is not None}
+            return replace(episode, videos=videos, camera_pose={camera: taken.pose for camera, taken in films.items()})
+
+        return add
+
+    return make
+
+
+def cameras_attribute(options: FilmOptions) -> Attribute:
+    """Return the attribute `cameras` of a shard of episodes."""
+    size = options.width, options.height
+    matrix = {camera: intrinsics(*size, VIEWS[camera]).tolist() for camera in options.cameras}
+    return json.dumps(
+        {name: {"width": size[0], "height": size[1], "intrinsics": k, "codec": "av1"} for name, k in matrix.items()}
+    )

@@ -142,9 +142,7 @@ def normal_at(scene: Triangles, face: wp.int32, eye: wp.vec3f, direction: wp.vec
 
 
 @wp.func
-def is_dark(
-    view: View, key_in: wp.array3d[wp.int64], k: wp.int32, point: wp.vec3f, normal: wp.vec3f, toward: wp.vec3f
-):
+def is_dark(view: View, key_in: wp.array3d[wp.int64], k: wp.int32, point: wp.vec3f, normal: wp.vec3f, toward: wp.vec3f):
     """Check whether a solid is nearer to the light; points outside of the map are lit."""
     texel = 1.0 / view.focal
     # The map's samples differ by their size: the point is moved out of its own surface.
@@ -238,9 +236,7 @@ def shade(
             albedo = m.base
             if m.pattern != shading.PLAIN:
                 albedo = shading.surface_colour(m, wp.transform_point(wp.transform_inverse(scene.pose[part]), point))
-            colour = shading.radiance(
-                m, light, albedo, normal, wp.normalize(direction), lamp, 1.0, from_lamp, from_sky
-            )
+            colour = shading.radiance(m, light, albedo, normal, wp.normalize(direction), lamp, 1.0, from_lamp, from_sky)
             last_normal = normal
         last = face
         total += colour
