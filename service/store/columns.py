@@ -284,9 +284,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "arm_mount": RootAttribute("text", "link of the arm that carries the hand", _EPISODES),
     "arm_mount_pose": RootAttribute("text", "pose of the hand's root link in the frame of this link", _EPISODES),
     "arm_base": RootAttribute("text", "pose of the arm's root link in the scene", _EPISODES),
-    "cameras": RootAttribute(
-        "text", "JSON: width, height, intrinsics and codec of each camera; absent: none", _EPISODES
-    ),
+    "cameras": RootAttribute("text", "JSON: size, intrinsics and codec of each camera; absent: none", _EPISODES),
 }
 
 

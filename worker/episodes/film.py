@@ -16,7 +16,6 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
-from graspd.service.model.pinhole import pixel_rays
 from graspd.service.model.scene_spec import Box as BoxSupport
 from graspd.service.model.scene_spec import HalfSpace, scene_supports
 from graspd.service.model.transforms import (
@@ -290,7 +289,7 @@ class EpisodeRenderer:
         return found
 
     def _find_scene_camera(self, poses: Floats, middle: Floats, radius: float, rng: Generator) -> tuple[Floats, Floats]:
-        """Return place (3,) and aim (3,); of a few draws, those that show most of the object when it is least visible."""
+        """Return place (3,) and aim (3,): of a few draws, those whose worst moment shows most of the object."""
         draws = []
         for _ in range(_DRAWS):
             aim = middle + rng.uniform(-AIM_M, AIM_M, 3)
@@ -361,7 +360,8 @@ def _camera_pose(eye: Floats, target: Floats, up: Sequence[float] | Floats = (0.
     return np.asarray(pose_from_matrix(np.linalg.inv(look_at(eye, target, up))), float)
 
 
-def _import_av() -> Any:
+def import_av() -> Any:
+    """Return PyAV. Raises InputError: it is not installed."""
     try:
         # The encoder reports its settings of each film unless its level is set before.
         os.environ.setdefault("SVT_LOG", "1")
@@ -379,7 +379,7 @@ _FFV1: Final = {2: ("ffv1", "matroska", "gray16le", {}), 1: ("ffv1", "matroska",
 def encode(pictures: NDArray[Any], fps: float) -> bytes:
     """Encode colours (T, H, W, 3) as AV1 in MP4, depth or labels (T, H, W) as FFV1 in Matroska.
     Raises InputError: PyAV is not installed."""
-    av = _import_av()
+    av = import_av()
     colour = pictures.ndim == 4
     codec, container, format_, options = _AV1 if colour else _FFV1[pictures.itemsize]
     buffer = io.BytesIO()
