@@ -88,6 +88,7 @@ def shard_id(
         inputs_of |= {k: getattr(request, k) for k in ("views", "stereo", "width", "height", "channels")}
     elif stage is Stage.EPISODE:
         inputs_of |= {k: getattr(request, k) for k in ("episodes", "film", "episode_fps")}
+        inputs_of |= {k: getattr(request, k) for k in ("width", "height") if request.film}
     return digest_json(inputs_of)
 
 

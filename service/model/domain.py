@@ -351,6 +351,8 @@ class JobOptions(Model):
             raise ValueError("free grasps have no episodes: choose a scene, such as table")
         if self.film and not self.has_episodes:
             raise ValueError("film shows episodes: choose a robot for them, such as flying")
+        if self.film and (self.width % 2 or self.height % 2):
+            raise ValueError(f"a film of {self.width} x {self.height} cannot be encoded: choose even numbers")
         if self.validation == "none":
             self._check_without_validation()
         return self

@@ -1,6 +1,6 @@
 """Episodes of a base shard's grasps, and the HDF5 shard of episodes."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import ConflictError, InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats
 from graspd.service.store import validity
-from graspd.service.store.columns import CAMERAS, SCHEMAS, Attribute
+from graspd.service.store.columns import CAMERAS, SCHEMAS, VIDEOS, Attribute
 from graspd.service.store.shards import Shard
 from graspd.worker.episodes.episode import Episode, EpisodeOutcome, Robot
 from graspd.worker.episodes.execution import Executions, ToolFrame, build_executions
@@ -38,8 +38,8 @@ _INHERITED: Final = (
 )
 _FRAMES: Final = ("state", "action", "phase", "object_pose", "neighbour_pose")
 
-#: Returns the file of each camera that films an episode, by its name in `CAMERAS`.
-Film = Callable[[Episode], Mapping[str, bytes]]
+#: Adds videos and camera poses to an episode.
+Film = Callable[[Episode], Episode]
 #: Makes the film of one thread, for a robot and its grasps.
 FilmMaker = Callable[[Robot, Executions], Film]
 
@@ -120,7 +120,7 @@ def execute_grasps(
         shard_row, scene, motion = int(found.rows[row]), int(placed.index[row]), planner.plan(row)
         if isinstance(motion, Motion):
             episode = simulation.execute(motion, row, shard_row)
-            episode = episode if camera is None else replace(episode, videos=camera(episode))
+            episode = episode if camera is None else camera(episode)
         else:
             episode = replace(_no_frames(robot, placed), row=shard_row, scene=scene, outcome=motion)
         done.add(1)
@@ -184,10 +184,13 @@ def episode_columns(episodes: list[Episode], robot: Robot, placed: PlacedGrasps)
     if placed.neighbours:
         columns["scene/neighbour_pose"] = np.asarray(placed.neighbour_pose)
     for camera in CAMERAS:
-        files = [one.videos.get(camera, b"") for one in episodes]
-        if any(files):
-            columns[f"video/{camera}"] = np.frombuffer(b"".join(files), np.uint8)
-            columns[f"video/{camera}_bytes"] = np.array([len(file) for file in files], np.int64)
+        if poses := [one.camera_pose[camera] for one in episodes if camera in one.camera_pose]:
+            columns[f"camera/{camera}_pose"] = np.concatenate(poses)
+        for name in VIDEOS[camera]:
+            files = [one.videos.get(name, b"") for one in episodes]
+            if any(files):
+                columns[f"video/{name}"] = np.frombuffer(b"".join(files), np.uint8)
+                columns[f"video/{name}_bytes"] = np.array([len(file) for file in files], np.int64)
     return columns
 
 
@@ -198,22 +201,29 @@ def episodes_of_shard(shard: Shard) -> list[Episode]:
     for name in _FRAMES:
         if (column := shard.arrays.get(f"frame/{name}")) is not None:
             parts[name] = np.split(column if name == "phase" else np.asarray(column, float), ends)
-    videos = {camera: _files(shard, camera) for camera in CAMERAS if f"video/{camera}" in shard.arrays}
+    videos = {
+        name: _files(shard, name) for names in VIDEOS.values() for name in names if f"video/{name}" in shard.arrays
+    }
+    paths = {camera: f"camera/{camera}_pose" for camera in CAMERAS}
+    cameras = {
+        camera: np.split(np.asarray(shard[path], float), ends) for camera, path in paths.items() if path in shard.arrays
+    }
     return [
         Episode(
             row=int(shard["episode/row"][number]),
             scene=int(shard["episode/scene_index"][number]),
             outcome=EpisodeOutcome(int(shard["episode/outcome"][number])),
-            videos={camera: files[number] for camera, files in videos.items()},
+            videos={name: files[number] for name, files in videos.items()},
+            camera_pose={camera: poses[number] for camera, poses in cameras.items()},
             **{name: part[number] for name, part in parts.items()},
         )
         for number in range(len(counts))
     ]
 
 
-def _files(shard: Shard, camera: str) -> list[bytes]:
-    ends = np.cumsum(shard[f"video/{camera}_bytes"])
-    return [part.tobytes() for part in np.split(shard[f"video/{camera}"], ends[:-1])]
+def _files(shard: Shard, video: str) -> list[bytes]:
+    ends = np.cumsum(shard[f"video/{video}_bytes"])
+    return [part.tobytes() for part in np.split(shard[f"video/{video}"], ends[:-1])]
 
 
 def _robot_attributes(robot: Robot, options: EpisodeOptions) -> dict[str, Attribute]:

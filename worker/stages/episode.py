@@ -5,6 +5,7 @@ import numpy as np
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.states import Stage
 from graspd.service.store.columns import Attribute
+from graspd.worker.episodes.film import FilmOptions, cameras_attribute, film_maker
 from graspd.worker.episodes.shard import EpisodeOptions, record_episodes
 from graspd.worker.stages import assets
 from graspd.worker.stages.context import Output, TaskContext, batch_seed
@@ -23,7 +24,10 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     arm = None if request.episodes == "flying" else request.episodes
     options = EpisodeOptions(arm, fps=request.episode_fps, seed=batch_seed(message), empty=True)
     pieces = assets.load_pieces(store, obj)
-    columns, found = record_episodes(base, hand, obj, placed, options, pieces=pieces, run=context.run)
+    films = FilmOptions(request.film, request.width, request.height, request.episode_fps)
+    film = film_maker(base, films, options.seed, context.run) if request.film else None
+    columns, found = record_episodes(base, hand, obj, placed, options, pieces=pieces, film=film, run=context.run)
     attributes: dict[str, Attribute] = {name: value for name, value in found.items() if name not in _OF_TASK}
+    attributes |= {"cameras": cameras_attribute(films)} if film else {}
     attributes |= {"base_shard": message.inputs[0], "scene_shard": base.attributes["scene_shard"]}
     return Output(columns, attributes)

@@ -215,6 +215,7 @@ def test_a_document_comes_back_and_fingertips_may_touch_unless_it_says_otherwise
         ({"episodes": "flying"}, "free grasps have no episodes"),
         ({"scene": "table", "episodes": "flying", "validation": "none"}, "episodes execute valid grasps"),
         ({"scene": "table", "film": ["scene"]}, "film shows episodes"),
+        ({"scene": "table", "episodes": "flying", "film": ["scene"], "width": 321}, "choose even numbers"),
         ({"touch": 1}, "no supports to touch"),
         ({"scene": "table", "touch": -1.5}, "greater than or equal to -1"),
         ({"scene": "table", "touch": NAN}, "finite number"),
