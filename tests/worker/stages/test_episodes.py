@@ -22,6 +22,7 @@ from graspd.service.settings import Settings
 from graspd.service.store.columns import EXECUTED
 from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard
 from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.files.subsets import open_source
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages import episode, stage_table
 from graspd.worker.stages.context import StopReason, TaskContext, build_shard
@@ -118,8 +119,10 @@ def test_a_batch_without_a_valid_grasp_has_an_empty_shard(
 
 
 def test_a_store_with_episodes_is_verified_and_they_go_with_their_job(
-    services: Services, job: JobRecord, made: ShardManifest
+    services: Services, job: JobRecord, made: ShardManifest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("GRASPD_DATA_DIR", str(services.settings.data_dir))
+    assert [file.id for file in open_source(job.id).of_kind("episodes")] == [made.shard_id], "exports name the job"
     folder = f"{names.SHARDS}/episodes"
     assert [damage for _, damage in integrity.scan(services.store) if damage] == []
     assert {key for key, _ in integrity.scan(services.store, folder)} >= {made.key}
