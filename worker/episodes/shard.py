@@ -77,54 +77,35 @@ def record_episodes(
         )
     rows = np.flatnonzero(select_grasps(base)[0])[: options.limit or None]
     robot = read_robot(hand, options.arm, mount=options.mount, mount_pose=options.mount_pose, base=options.base)
-    tool = ToolFrame(hand.root_link, IDENTITY_POSE)
-    grasps = GraspSet.from_columns(base.arrays).take(rows)
+    grasps, tool = GraspSet.from_columns(base.arrays).take(rows), ToolFrame(hand.root_link, IDENTITY_POSE)
     found = build_executions(hand, obj, grasps, rows=rows, placed=placed.take(rows), tool=tool, quality={})
-    episodes = execute_grasps(robot, found, pieces or decompose(obj), options, film=film, run=run)
-    inherited = {name: base.attributes[name] for name in (*INHERITED, *_INHERITED) if name in base.attributes}
-    attributes: dict[str, Attribute] = inherited | source_attributes(base) | _robot_attributes(robot, options)
-    attributes |= {"seed": options.seed, "fps": options.fps, "device": "cpu"}
-    columns = episode_columns(episodes, placed) | {
-        path: np.asarray(base.arrays[path])[found.rows]
-        for path in SCHEMAS["episodes"]
-        if path.startswith("quality/") and path in base.arrays
-    }
-    return columns, attributes | {"seconds": round(perf_counter() - began, 4)}
-
-
-def execute_grasps(
-    robot: Robot,
-    found: Executions,
-    pieces: ConvexPieces,
-    options: EpisodeOptions,
-    *,
-    film: FilmMaker | None = None,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-) -> list[Episode]:
-    """Plan, execute and film an episode for each grasp in a scene."""
-    assert found.placed is not None, "episodes need grasps in scenes"
-    placed, done = found.placed, Count(len(found), run, "episodes")
+    convex, done = pieces or decompose(obj), Count(len(found), run, "episodes")
 
     def make() -> tuple[MotionPlanner, Simulation, Film | None]:
-        planner = MotionPlanner(robot, found, pieces, seed=options.seed)
-        simulation = Simulation(robot, found.obj, pieces, placed, fps=options.fps)
-        return planner, simulation, None if film is None else film(robot, found)
+        planner = MotionPlanner(robot, found, convex, seed=options.seed)
+        return planner, Simulation(robot, obj, convex, placed, fps=options.fps), film and film(robot, found)
 
     def execute(tools: tuple[MotionPlanner, Simulation, Film | None], row: int) -> Episode:
         run.check("the execution of grasps")
         planner, simulation, camera = tools
-        shard_row, scene, motion = int(found.rows[row]), int(placed.index[row]), planner.plan(row)
+        motion, shard_row = planner.plan(row), int(rows[row])
         if isinstance(motion, Motion):
-            episode = simulation.execute(motion, row, shard_row)
+            episode = simulation.execute(motion, shard_row)
             episode = episode if camera is None else camera(episode)
         else:
-            none = np.zeros((0, len(robot.names)))
-            beside = np.zeros((0, len(placed.neighbours), 7))
-            episode = Episode(shard_row, scene, motion, np.zeros(0, np.uint8), none, none, np.zeros((0, 7)), beside)
+            none, beside = np.zeros((0, len(robot.names))), np.zeros((0, len(placed.neighbours), 7))
+            scene, phase = int(placed.index[shard_row]), np.zeros(0, np.uint8)
+            episode = Episode(shard_row, scene, motion, phase, none, none, neighbour_pose=beside)
         done.add(1)
         return episode
 
-    return evaluate_rows(range(len(found)), make, execute, threads=run.cores, name="episode")
+    episodes = evaluate_rows(range(len(found)), make, execute, threads=run.cores, name="episode")
+    inherited = {name: base.attributes[name] for name in (*INHERITED, *_INHERITED) if name in base.attributes}
+    attributes: dict[str, Attribute] = inherited | source_attributes(base) | _robot_attributes(robot, options)
+    attributes |= {"seed": options.seed, "fps": options.fps, "device": "cpu"}
+    quality = [path for path in SCHEMAS["episodes"] if path.startswith("quality/") and path in base.arrays]
+    columns = episode_columns(episodes, placed) | {path: np.asarray(base.arrays[path])[rows] for path in quality}
+    return columns, attributes | {"seconds": round(perf_counter() - began, 4)}
 
 
 def replay_episodes(
