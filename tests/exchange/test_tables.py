@@ -1,11 +1,8 @@
 """Data sets of tables for Hugging Face's `datasets`: each file as its readers take it, grasps as they were."""
 
 import io
-import itertools
 import json
-import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,8 +15,6 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import apply, compose, pose_from_matrix
 from graspd.service.readers import Pictures, open_shards
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.load import hand_from_path
-from tests.worker.commands_run import graspd, refused
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
 #: Poses in float64 from one frame into another [m].

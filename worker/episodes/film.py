@@ -373,7 +373,7 @@ def import_av() -> Any:
 
 #: AV1 with a key frame every 10 frames; lossless FFV1 for depth and segmentation.
 _AV1: Final = ("libsvtav1", "mp4", "yuv420p", {"preset": "12", "crf": "26", "g": "10", "svtav1-params": "lp=1"})
-_FFV1: Final[dict[int, tuple[str, str, str, dict[str, str]]]] = {2: ("ffv1", "matroska", "gray16le", {}), 1: ("ffv1", "matroska", "gray", {})}
+_FFV1: Final = {1: "gray", 2: "gray16le"}
 
 
 def encode(pictures: NDArray[Any], fps: float) -> bytes:
@@ -381,7 +381,7 @@ def encode(pictures: NDArray[Any], fps: float) -> bytes:
     Raises InputError: PyAV is not installed."""
     av = import_av()
     colour = pictures.ndim == 4
-    codec, container, format_, options = _AV1 if colour else _FFV1[pictures.itemsize]
+    codec, container, format_, options = _AV1 if colour else ("ffv1", "matroska", _FFV1[pictures.itemsize], {})
     buffer = io.BytesIO()
     with av.open(buffer, "w", format=container) as out:
         stream = out.add_stream(codec, rate=round(fps), options=options)
