@@ -85,7 +85,7 @@ def episode_parts(shards: Shards, obj: str | None, *, every: bool) -> list[Episo
     parts = []
     for file in shards.of_kind("episodes"):
         shard = read_shard(shards.path(file), kind="episodes")
-        chosen = shard["episode/frames"] > 0
+        chosen = np.asarray(shard["episode/frames"], int) > 0
         if not every:
             chosen &= shard["episode/outcome"] == EpisodeOutcome.SUCCEEDED
         if chosen.any():

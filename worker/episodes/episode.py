@@ -70,7 +70,7 @@ class Episode:
     phase: NDArray[np.uint8]  # (T,) indices of `PHASES`
     state: Floats  # (T, D) measured, in the order of `Robot.names` [m, 1, rad]
     action: Floats  # (T, D) commanded from this frame to the next
-    object_pose: Floats  # (T, 7) in the scene
+    object_pose: Floats = field(default_factory=lambda: np.zeros((0, 7)))  # (T, 7) in the scene
     neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))  # (T, M, 7) in the scene
     videos: Mapping[str, bytes] = field(default_factory=dict)  # video of each of `columns.VIDEOS`
     camera_pose: Mapping[str, Floats] = field(default_factory=dict)

@@ -345,7 +345,7 @@ def _quat_last(poses: Floats) -> NDArray[np.float32]:
 
 
 def _view_structs(poses: Floats) -> NDArray[Any]:
-    views = np.zeros(len(poses), raster.View.numpy_dtype())
+    views: NDArray[Any] = np.zeros(len(poses), raster.View.numpy_dtype())
     views["place"], views["inverse"] = _quat_last(poses), _quat_last(invert(poses))
     return views
 
@@ -356,7 +356,7 @@ def _direction(azimuth: float, elevation: float) -> Floats:
 
 
 def _camera_pose(eye: Floats, target: Floats, up: Sequence[float] | Floats = (0.0, 0.0, 1.0)) -> Floats:
-    return np.asarray(pose_from_matrix(np.linalg.inv(look_at(eye, target, up))), float)
+    return pose_from_matrix(np.asarray(np.linalg.inv(look_at(eye, target, up)), np.float64))
 
 
 def import_av() -> Any:
@@ -366,13 +366,13 @@ def import_av() -> Any:
         os.environ.setdefault("SVT_LOG", "1")
         import av
     except ModuleNotFoundError:
-        raise InputError("films need PyAV; install it: pip install 'graspd[episodes]'") from None
+        raise InputError("films need PyAV; install it: pip install 'graspd[film]'") from None
     return av
 
 
 #: AV1 with a key frame every 10 frames; lossless FFV1 for depth and segmentation.
 _AV1: Final = ("libsvtav1", "mp4", "yuv420p", {"preset": "12", "crf": "26", "g": "10", "svtav1-params": "lp=1"})
-_FFV1: Final = {2: ("ffv1", "matroska", "gray16le", {}), 1: ("ffv1", "matroska", "gray", {})}
+_FFV1: Final = {1: "gray", 2: "gray16le"}
 
 
 def encode(pictures: NDArray[Any], fps: float) -> bytes:
@@ -380,7 +380,7 @@ def encode(pictures: NDArray[Any], fps: float) -> bytes:
     Raises InputError: PyAV is not installed."""
     av = import_av()
     colour = pictures.ndim == 4
-    codec, container, format_, options = _AV1 if colour else _FFV1[pictures.itemsize]
+    codec, container, format_, options = _AV1 if colour else ("ffv1", "matroska", _FFV1[pictures.itemsize], {})
     buffer = io.BytesIO()
     with av.open(buffer, "w", format=container) as out:
         stream = out.add_stream(codec, rate=round(fps), options=options)
@@ -404,7 +404,7 @@ def film_maker(
 
         def add(episode: Episode) -> Episode:
             films = renderer.film(episode, (seed, episode.row), run)
-            videos = {}
+            videos = dict[str, bytes]()
             for camera, taken in films.items():
                 pictures = {"": taken.rgb, "_depth": taken.depth, "_segmentation": taken.segmentation}
                 videos |= {camera + kind: encode(one, options.fps) for kind, one in pictures.items() if one is not None}

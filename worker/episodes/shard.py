@@ -80,53 +80,35 @@ def record_episodes(
     valid = validity.valid_mask(base.arrays) if options.empty else select_grasps(base)[0]
     rows = np.flatnonzero(valid)[: options.limit or None]
     robot = read_robot(hand, options.arm, mount=options.mount, mount_pose=options.mount_pose, base=options.base)
-    episodes: list[Episode] = []
-    if len(rows):
-        tool, grasps = ToolFrame(hand.root_link, IDENTITY_POSE), GraspSet.from_columns(base.arrays).take(rows)
-        found = build_executions(hand, obj, grasps, rows=rows, placed=placed.take(rows), tool=tool, quality={})
-        episodes = execute_grasps(robot, found, pieces or decompose(obj), options, film=film, run=run)
-    inherited = {name: base.attributes[name] for name in (*INHERITED, *_INHERITED) if name in base.attributes}
-    attributes: dict[str, Attribute] = inherited | source_attributes(base) | _robot_attributes(robot, options)
-    attributes |= {"seed": options.seed, "fps": options.fps, "device": "cpu"}
-    columns = episode_columns(episodes, robot, placed) | {
-        path: np.asarray(base.arrays[path])[rows]
-        for path in SCHEMAS["episodes"]
-        if path.startswith("quality/") and path in base.arrays
-    }
-    return columns, attributes | {"seconds": round(perf_counter() - began, 4)}
-
-
-def execute_grasps(
-    robot: Robot,
-    found: Executions,
-    pieces: ConvexPieces,
-    options: EpisodeOptions,
-    *,
-    film: FilmMaker | None = None,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-) -> list[Episode]:
-    """Plan, execute and film an episode for each grasp in a scene."""
-    assert found.placed is not None, "episodes need grasps in scenes"
-    placed, done = found.placed, Count(len(found), run, "episodes")
+    grasps, tool = GraspSet.from_columns(base.arrays).take(rows), ToolFrame(hand.root_link, IDENTITY_POSE)
+    found = build_executions(hand, obj, grasps, rows=rows, placed=placed.take(rows), tool=tool, quality={})
+    convex, done = pieces or decompose(obj), Count(len(found), run, "episodes")
+    state, beside = np.zeros((0, len(robot.names))), np.zeros((0, len(placed.neighbours), 7))
+    none = Episode(0, 0, EpisodeOutcome.NO_TRANSIT, np.zeros(0, np.uint8), state, state, neighbour_pose=beside)
 
     def make() -> tuple[MotionPlanner, Simulation, Film | None]:
-        planner = MotionPlanner(robot, found, pieces, seed=options.seed)
-        simulation = Simulation(robot, found.obj, pieces, placed, fps=options.fps)
-        return planner, simulation, None if film is None else film(robot, found)
+        planner = MotionPlanner(robot, found, convex, seed=options.seed)
+        return planner, Simulation(robot, obj, convex, placed, fps=options.fps), film and film(robot, found)
 
     def execute(tools: tuple[MotionPlanner, Simulation, Film | None], row: int) -> Episode:
         run.check("the execution of grasps")
         planner, simulation, camera = tools
-        shard_row, scene, motion = int(found.rows[row]), int(placed.index[row]), planner.plan(row)
+        motion, shard_row = planner.plan(row), int(rows[row])
         if isinstance(motion, Motion):
-            episode = simulation.execute(motion, row, shard_row)
+            episode = simulation.execute(motion, shard_row)
             episode = episode if camera is None else camera(episode)
         else:
-            episode = replace(_no_frames(robot, placed), row=shard_row, scene=scene, outcome=motion)
+            episode = replace(none, row=shard_row, scene=int(placed.index[shard_row]), outcome=motion)
         done.add(1)
         return episode
 
-    return evaluate_rows(range(len(found)), make, execute, threads=run.cores, name="episode")
+    episodes = evaluate_rows(range(len(found)), make, execute, threads=run.cores, name="episode")
+    inherited = {name: base.attributes[name] for name in (*INHERITED, *_INHERITED) if name in base.attributes}
+    attributes: dict[str, Attribute] = inherited | source_attributes(base) | _robot_attributes(robot, options)
+    attributes |= {"seed": options.seed, "fps": options.fps, "device": "cpu"}
+    quality = [path for path in SCHEMAS["episodes"] if path.startswith("quality/") and path in base.arrays]
+    columns = episode_columns(episodes, none, placed) | {path: np.asarray(base.arrays[path])[rows] for path in quality}
+    return columns, attributes | {"seconds": round(perf_counter() - began, 4)}
 
 
 def replay_episodes(
@@ -164,14 +146,8 @@ def robot_of_shard(shard: Shard, hand: HandModel) -> Robot:
     return robot
 
 
-def _no_frames(robot: Robot, placed: PlacedGrasps) -> Episode:
-    none, beside = (np.zeros((0, *shape), np.float32) for shape in ((len(robot.names),), (len(placed.neighbours), 7)))
-    return Episode(0, 0, EpisodeOutcome.NO_TRANSIT, np.zeros(0, np.uint8), none, none, none[:, :7], beside)
-
-
-def episode_columns(episodes: list[Episode], robot: Robot, placed: PlacedGrasps) -> dict[str, NDArray[Any]]:
-    """Return the columns of a shard of episodes, except those of the grasps' quality."""
-    none = _no_frames(robot, placed)
+def episode_columns(episodes: list[Episode], none: Episode, placed: PlacedGrasps) -> dict[str, NDArray[Any]]:
+    """Return the columns of a shard of episodes, except those of the grasps' quality; `none` has no frames."""
     columns: dict[str, NDArray[Any]] = {
         "episode/row": np.array([one.row for one in episodes], np.int32),
         "episode/scene_index": np.array([one.scene for one in episodes], np.int32),
@@ -180,7 +156,8 @@ def episode_columns(episodes: list[Episode], robot: Robot, placed: PlacedGrasps)
         "scene/object_pose": np.asarray(placed.object_pose),
     }
     for name in _FRAMES if placed.neighbours else _FRAMES[:-1]:
-        columns[f"frame/{name}"] = np.concatenate([getattr(one, name) for one in (none, *episodes)])
+        parts, dtype = [getattr(one, name) for one in (none, *episodes)], SCHEMAS["episodes"][f"frame/{name}"].dtype
+        columns[f"frame/{name}"] = np.concatenate(parts, dtype=dtype, casting="same_kind")
     if placed.neighbours:
         columns["scene/neighbour_pose"] = np.asarray(placed.neighbour_pose)
     for camera in CAMERAS:

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import Floats, apply, compose, invert, quat_conjugate, quat_multiply, quat_rotate
@@ -22,7 +22,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import UP, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import NEIGHBOUR_MOVED_M, NEIGHBOUR_TILTED
-from graspd.worker.validation.model import MujocoOptions, Scene, add_bodies, build_scene
+from graspd.worker.validation.model import FreeBody, MujocoOptions, add_bodies, build_scene
 from graspd.worker.validation.protocol import MAX_DISPLACEMENT_M, MAX_ROTATION
 
 #: Error at which a drive of an arm has its effort limit [rad], [m], and inertia of the drive [kg m^2], [kg].
@@ -41,164 +41,139 @@ class Simulation:
     def __init__(
         self, robot: Robot, obj: ObjectModel, pieces: ConvexPieces, placed: PlacedGrasps, *, fps: float
     ) -> None:
-        self.robot, self.obj, self.placed, self.fps = robot, obj, placed, fps
-        longest = MujocoOptions().timestep
-        self.steps = int(np.ceil(1 / (fps * longest) - 1e-9))  # per frame
+        self.robot, self.placed, self.fps = robot, placed, fps
+        self.steps = int(np.ceil(1 / (fps * MujocoOptions().timestep) - 1e-9))  # per frame
         physics = MujocoOptions(timestep=1 / (fps * self.steps))
         carrier = None if robot.arm is None else lambda spec: _add_arm(spec, robot, pieces, placed)
-        self.scene: Scene = build_scene(
-            robot.hand, obj, pieces, physics, placed.supports, placed.neighbours, carrier=carrier
-        )
-        model = self.scene.model
-        self.data: Any = mujoco.MjData(model)
-        tree = None if robot.arm is None else robot.arm.model
-        names = () if tree is None else (f"arm{body}" for body in tree.joint_body)
-        self._arm_qpos = np.array([int(model.joint(name).qposadr[0]) for name in names], np.intp)
+        scene = build_scene(robot.hand, obj, pieces, physics, placed.supports, placed.neighbours, carrier=carrier)
+        self.scene, self.model = scene, scene.model
+        self.data: Any = mujoco.MjData(self.model)
         self._split = len(robot.names) - robot.hand.dofs
-
-    def run(self, actions: Floats, start: Floats, scene: int) -> tuple[Floats, Floats, Floats]:
-        """Execute actions (T, D) from a state (D,) on; return states (T, D) and poses of objects (T, 7), (T, M, 7).
-        The last action is not executed. After a numerical divergence there are fewer frames."""
-        self._set_up(start, scene)
-        model, data = self.scene.model, self.data
-        targets = np.concatenate([start[None], actions])
-        controls, flying = self._controls(targets), self.robot.arm is None
-        states, things, beside = [start], [self._object_pose()], [self._neighbour_poses()]
-        for frame in range(len(actions) - 1):
-            for share in np.arange(1, self.steps + 1) / self.steps:
-                data.ctrl[:] = (1 - share) * controls[frame] + share * controls[frame + 1]
-                if flying:
-                    pose = (1 - share) * targets[frame, :7] + share * targets[frame + 1, :7]
-                    data.mocap_pos[0], data.mocap_quat[0] = pose[:3], pose[3:] / np.linalg.norm(pose[3:])
-                mujoco.mj_step(model, data)
-            if is_invalid(data):
-                break
-            states.append(self._state(states[-1]))
-            things.append(self._object_pose())
-            beside.append(self._neighbour_poses())
-        return as_float32(states), as_float32(things), as_float32(beside)
-
-    def _set_up(self, start: Floats, scene: int) -> None:
-        data, carrier = self.data, start[: self._split]
-        mujoco.mj_resetData(self.scene.model, data)
-        data.qpos[self.scene.joint_qpos] = self.robot.hand.expand(start[self._split :])
-        if self.robot.arm is None:
-            pose = np.concatenate([carrier[:3], carrier[3:] / np.linalg.norm(carrier[3:])])
-            data.qpos[self.scene.root_qpos : self.scene.root_qpos + 7] = pose
-            data.mocap_pos[0], data.mocap_quat[0] = pose[:3], pose[3:]
+        if robot.arm is None:
+            self._carrier = np.arange(scene.root_qpos, scene.root_qpos + 7)
         else:
-            data.qpos[self._arm_qpos] = self.robot.arm.model.expand(carrier)
-        data.ctrl[:] = self._controls(start)
-        rest = np.asarray(self.placed.object_pose[scene], float)
-        bodies = [(self.scene.object_body, self.scene.object_qpos, self.scene.centre, self.scene.mass, rest)]
-        for free, pose in zip(self.scene.neighbours, self._resting_neighbours(scene), strict=True):
-            bodies.append((free.body, free.qpos, free.centre, free.mass, pose))
-        for body, qpos, centre, mass, pose in bodies:
-            data.qpos[qpos : qpos + 7] = [*apply(pose, centre), *pose[3:]]
-            data.xfrc_applied[body, :3] = -ACCELERATION * mass * UP
+            joints = robot.arm.model.joint_body
+            self._carrier = np.array([int(self.model.joint(f"arm{body}").qposadr[0]) for body in joints], np.intp)
+        target = FreeBody(scene.object_body, scene.object_qpos, scene.centre, scene.mass)
+        self._things = (target, *scene.neighbours)
 
-    def _resting_neighbours(self, scene: int) -> Floats:
-        return np.asarray(self.placed.neighbour_pose[scene], float) if self.placed.neighbours else np.zeros((0, 7))
-
-    def _controls(self, targets: Floats) -> Floats:
-        """Return the controls (..., A) for targets (..., D)."""
-        of_hand = self.scene.controls(self.robot.hand.expand(targets[..., self._split :]))
-        if self.robot.arm is None:
-            return of_hand
-        return np.concatenate([self.robot.arm.model.expand(targets[..., : self._split]), of_hand], axis=-1)
-
-    def _state(self, before: Floats) -> Floats:
-        qpos, root = self.data.qpos, self.scene.root_qpos
-        if self.robot.arm is None:
-            carrier = np.array(qpos[root : root + 7])
-            if carrier[3:] @ before[3:7] < 0:
-                carrier[3:] *= -1  # without jumps between frames
-        else:
-            carrier = self.robot.arm.model.reduce(qpos[self._arm_qpos])
-        return np.concatenate([carrier, self.robot.hand.reduce(qpos[self.scene.joint_qpos])])
-
-    def _object_pose(self) -> Floats:
-        return _mesh_pose(self.data.qpos[self.scene.object_qpos :][:7], self.scene.centre)
-
-    def _neighbour_poses(self) -> Floats:
-        poses = [_mesh_pose(self.data.qpos[free.qpos :][:7], free.centre) for free in self.scene.neighbours]
-        return np.array(poses).reshape(-1, 7)
-
-    def execute(self, motion: Motion, row: int, shard_row: int) -> Episode:
-        """Execute the motion of grasp `row` of the simulation's grasps, which has row `shard_row` in its shard."""
-        phase, targets = sample_motion(motion, self.fps)
-        actions = np.concatenate([targets[1:], targets[-1:]])
-        nothing = np.zeros((0, 7))
-        scene = int(self.placed.index[row])
-        return self._record(Episode(shard_row, scene, EpisodeOutcome.SUCCEEDED, phase, targets[:1], actions, nothing))
+    def execute(self, motion: Motion, row: int) -> Episode:
+        """Execute the motion of the simulation's grasp `row`."""
+        times = np.arange(int(motion.time[-1] * self.fps + 1e-9) + 1) / self.fps
+        at = np.minimum(np.searchsorted(motion.time, times - 1e-9), len(motion.time) - 1)
+        targets = as_float32(np.stack([np.interp(times, motion.time, column) for column in motion.targets.T], axis=1))
+        actions, scene = np.concatenate([targets[1:], targets[-1:]]), int(self.placed.index[row])
+        planned = Episode(row, scene, EpisodeOutcome.DIVERGED, motion.phase[at], targets[:1], actions)
+        return self._run(planned)
 
     def replay(self, episode: Episode) -> Episode:
         """Execute the stored actions of an episode from its first state on."""
         if episode.outcome is EpisodeOutcome.DIVERGED:  # during the last action
             repeated = np.concatenate([episode.action, episode.action[-1:]])
             episode = replace(episode, action=repeated, phase=np.append(episode.phase, episode.phase[-1:]))
-        return self._record(episode)
+        return self._run(episode)
 
-    def _record(self, planned: Episode) -> Episode:
-        states, things, beside = self.run(planned.action, planned.state[0], planned.scene)
-        kept = slice(len(states))
-        found = replace(planned, state=states, object_pose=things, neighbour_pose=beside, phase=planned.phase[kept])
-        if len(states) < len(planned.action):
-            return replace(found, action=planned.action[kept], outcome=EpisodeOutcome.DIVERGED)
-        return replace(found, outcome=self.outcome(found))
+    def _run(self, planned: Episode) -> Episode:
+        """Execute all actions but the last one; after a numerical divergence there are fewer frames."""
+        targets = np.concatenate([planned.state[:1], planned.action])
+        controls = self._controls(targets)
+        self._set_up(targets[0], controls[0], planned.scene)
+        data, states, things = self.data, [targets[0]], [self._poses()]
+        for frame in range(len(planned.action) - 1):
+            for share in np.arange(1, self.steps + 1) / self.steps:
+                data.ctrl[:] = (1 - share) * controls[frame] + share * controls[frame + 1]
+                if self.robot.arm is None:
+                    pose = (1 - share) * targets[frame, :7] + share * targets[frame + 1, :7]
+                    data.mocap_pos[0], data.mocap_quat[0] = pose[:3], pose[3:] / np.linalg.norm(pose[3:])
+                mujoco.mj_step(self.model, data)
+            if is_invalid(data):
+                break
+            states.append(self._state(states[-1]))
+            things.append(self._poses())
+        poses, kept = as_float32(things), slice(len(states))
+        found = replace(
+            planned,
+            state=as_float32(states),
+            object_pose=poses[:, 0],
+            neighbour_pose=poses[:, 1:],
+            phase=planned.phase[kept],
+            action=planned.action[kept],
+            outcome=EpisodeOutcome.DIVERGED,
+        )
+        return found if len(states) < len(planned.action) else replace(found, outcome=self.outcome(found))
+
+    def _set_up(self, start: Floats, controls: Floats, scene: int) -> None:
+        data, carrier = self.data, start[: self._split].copy()
+        mujoco.mj_resetData(self.model, data)
+        data.qpos[self.scene.joint_qpos] = self.robot.hand.expand(start[self._split :])
+        if self.robot.arm is None:
+            carrier[3:] /= np.linalg.norm(carrier[3:])
+            data.mocap_pos[0], data.mocap_quat[0] = carrier[:3], carrier[3:]
+        else:
+            carrier = self.robot.arm.model.expand(carrier)
+        data.qpos[self._carrier], data.ctrl[:] = carrier, controls
+        for thing, pose in zip(self._things, self._rest(scene), strict=True):
+            data.qpos[thing.qpos : thing.qpos + 7] = [*apply(pose, thing.centre), *pose[3:]]
+            data.xfrc_applied[thing.body, :3] = -ACCELERATION * thing.mass * UP
+
+    def _rest(self, scene: int) -> Floats:
+        """Return poses (1 + M, 7) of the object and its neighbours at rest."""
+        beside = self.placed.neighbour_pose[scene] if self.placed.neighbours else np.zeros((0, 7))
+        return np.concatenate([np.asarray(self.placed.object_pose, float)[scene][None], beside])
+
+    def _poses(self) -> Floats:
+        """Return present poses (1 + M, 7) of the object and its neighbours."""
+        at = np.array([self.data.qpos[thing.qpos : thing.qpos + 7] for thing in self._things])
+        at[:, :3] -= quat_rotate(at[:, 3:], np.array([thing.centre for thing in self._things]))
+        return at
+
+    def _controls(self, targets: Floats) -> Floats:
+        """Return the controls (T, A) for targets (T, D)."""
+        of_hand = self.scene.controls(self.robot.hand.expand(targets[:, self._split :]))
+        arm = self.robot.arm
+        return of_hand if arm is None else np.hstack([arm.model.expand(targets[:, : self._split]), of_hand])
+
+    def _state(self, before: Floats) -> Floats:
+        carrier = self.data.qpos[self._carrier]
+        if self.robot.arm is not None:
+            carrier = self.robot.arm.model.reduce(carrier)
+        elif carrier[3:] @ before[3:7] < 0:
+            carrier[3:] *= -1  # without jumps between frames
+        return np.concatenate([carrier, self.robot.hand.reduce(self.data.qpos[self.scene.joint_qpos])])
 
     def outcome(self, episode: Episode) -> EpisodeOutcome:
         """Return the outcome of a complete episode by the rules of the lift test, from its frames alone."""
-        rest = np.asarray(self.placed.object_pose[episode.scene], float)
-        centre, thing = self.obj.centre_of_mass, episode.object_pose
-        early = thing[episode.phase < _CLOSE]
-        far = np.linalg.norm(apply(early, centre) - apply(rest, centre), axis=-1)
-        if (far > TOUCHED_M).any() or (_angles(early, rest) > MAX_ROTATION).any():
-            return EpisodeOutcome.TOUCHED
-        for one, at in enumerate(self._resting_neighbours(episode.scene)):
-            pose, middle = episode.neighbour_pose[:, one], self.placed.neighbours[one].obj.centre_of_mass
+        rest, thing, centre = self._rest(episode.scene), episode.object_pose, self.scene.centre
+        moved, turned = _motion(thing[episode.phase < _CLOSE], rest[0], centre)
+        touched = bool((moved > TOUCHED_M).any() or (turned > MAX_ROTATION).any())
+        for one, neighbour in enumerate(self.scene.neighbours):
+            pose, at = episode.neighbour_pose[:, one], rest[1 + one]
             up = quat_rotate(pose[:, 3:], quat_rotate(quat_conjugate(at[3:]), UP))
-            far = np.linalg.norm(apply(pose, middle) - apply(at, middle), axis=-1)
-            if (far > NEIGHBOUR_MOVED_M).any() or (up @ UP < np.cos(NEIGHBOUR_TILTED)).any():
-                return EpisodeOutcome.TOUCHED
+            moved, _ = _motion(pose, at, neighbour.centre)
+            touched |= bool((moved > NEIGHBOUR_MOVED_M).any() or (up @ UP < np.cos(NEIGHBOUR_TILTED)).any())
+        if touched:
+            return EpisodeOutcome.TOUCHED
         # The commanded state of a frame is the action of the frame before.
         last = np.flatnonzero(episode.phase <= _SQUEEZE)[-1]
-        root = self._root_poses(np.stack([episode.action[last - 1], episode.state[-1]]))
-        before, now = compose(invert(root[0]), rest), compose(invert(root[1]), thing[-1])
-        moved = float(np.linalg.norm(apply(now, centre) - apply(before, centre)))
-        if moved < MAX_DISPLACEMENT_M and float(_angles(now, before)) < MAX_ROTATION:
+        states = np.stack([episode.action[last - 1], episode.state[-1]])
+        before, now = compose(invert(self.robot.poses(states)[0][1][:, 0]), np.stack([rest[0], thing[-1]]))
+        moved, turned = _motion(now, before, centre)
+        if moved < MAX_DISPLACEMENT_M and turned < MAX_ROTATION:
             return EpisodeOutcome.SUCCEEDED
-        risen = (apply(thing, centre) - apply(rest, centre)) @ UP
+        risen = (apply(thing, centre) - apply(rest[0], centre)) @ UP
         return EpisodeOutcome.DROPPED if risen.max() > MAX_DISPLACEMENT_M else EpisodeOutcome.NOT_LIFTED
 
-    def _root_poses(self, states: Floats) -> Floats:
-        """Return (T, 7) poses of the hand's root in states (T, D)."""
-        return np.asarray(self.robot.poses(states)[0][1][:, 0])
 
-
-def sample_motion(motion: Motion, fps: float) -> tuple[NDArray[np.uint8], Floats]:
-    """Return phases (T,) and targets (T, D) of a motion at frames; quaternions have no jumps in sign."""
-    times = np.arange(int(motion.time[-1] * fps + 1e-9) + 1) / fps
-    at = np.minimum(np.searchsorted(motion.time, times - 1e-9), len(motion.time) - 1)
-    targets = np.stack([np.interp(times, motion.time, column) for column in motion.targets.T], axis=1)
-    return np.asarray(motion.phase)[at], as_float32(targets)
+def _motion(poses: Floats, start: Floats, centre: Floats) -> tuple[Floats, Floats]:
+    """Return displacements (...) of a point [m] and rotations (...) [rad] of poses (..., 7) from another one (7,)."""
+    turn = quat_multiply(quat_conjugate(start[3:]), poses[..., 3:])
+    angle = 2 * np.arctan2(np.linalg.norm(turn[..., 1:], axis=-1), np.abs(turn[..., 0]))
+    return np.linalg.norm(apply(poses, centre) - apply(start, centre), axis=-1), np.asarray(angle)
 
 
 def as_float32(values: ArrayLike) -> Floats:
     """Return values as episodes store them, with the precision of float32."""
     return np.asarray(values, np.float32).astype(float)
-
-
-def _mesh_pose(centre_pose: Floats, centre: Floats) -> Floats:
-    """Return the pose (7,) of a mesh frame from that of the body's frame at its centre of mass."""
-    turn = np.array(centre_pose[3:])
-    return np.concatenate([centre_pose[:3] - quat_rotate(turn, centre), turn])
-
-
-def _angles(poses: Floats, other: Floats) -> Floats:
-    """Return angles (...) between poses (..., 7) and another one (7,) [rad]."""
-    turn = quat_multiply(quat_conjugate(np.asarray(other)[3:]), poses[..., 3:])
-    return np.asarray(2 * np.arctan2(np.linalg.norm(turn[..., 1:], axis=-1), np.abs(turn[..., 0])))
 
 
 def _add_arm(spec: Any, robot: Robot, pieces: ConvexPieces, placed: PlacedGrasps) -> Any:

@@ -32,7 +32,8 @@ def open_source(source: str) -> Shards:
         store = open_store(load_settings().resolved_store_url, make=False)
     except NotFoundError as error:
         raise NotFoundError(f"{source} is no file or folder, and {error}") from None
-    return open_shards(store, **{"job" if re.fullmatch(DIGEST, source) else "dataset": source})
+    is_job = re.fullmatch(DIGEST, source) is not None
+    return open_shards(store, job=source) if is_job else open_shards(store, dataset=source)
 
 
 def require_empty_folder(folder: Path) -> None:

@@ -1,5 +1,6 @@
 """Files of episodes: `graspd episodes create` and `replay` on grasps of a block with another one beside it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import inherited_attributes, read_shard, write_shard
-from graspd.worker.episodes.episode import Episode
+from graspd.worker.episodes.episode import Episode, Robot
 from graspd.worker.episodes.shard import (
     EpisodeOptions,
     episodes_of_shard,
@@ -15,8 +16,10 @@ from graspd.worker.episodes.shard import (
     replay_episodes,
     robot_of_shard,
 )
+from graspd.worker.episodes.simulation import Simulation
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.provenance import hand_of_shard, object_of_shard, scenes_of_shard
+from graspd.worker.validation.decomposition import decompose
 from tests.worker.commands_run import graspd, refused
 
 PAIR = "synth --hand barrett --object block --fidelity draft --seed 3"
@@ -123,3 +126,13 @@ def test_grasps_without_a_scene_and_other_files_end_with_one_line(table: Path, t
     graspd(f"{PAIR} -n 1 -o", tmp_path / "free.h5")
     assert "--scene table" in refused("episodes create", tmp_path / "free.h5")
     assert "is needed here" in refused("episodes replay", table)
+
+
+@pytest.mark.parametrize(("aside", "outcome"), [(0.01, "SUCCEEDED"), (0.03, "TOUCHED")])
+def test_a_neighbour_may_move_by_2_cm(table: Path, aside: float, outcome: str) -> None:
+    shard = read_shard(create(table, "--limit 1", "one.h5")[1])
+    hand, obj, placed = hand_of_shard(shard, None), object_of_shard(shard, None), scenes_of_shard(shard)
+    simulation, (episode,) = Simulation(Robot(hand), obj, decompose(obj), placed, fps=15), episodes_of_shard(shard)
+    beside = episode.neighbour_pose.copy()
+    beside[-1, 0, 0] += aside
+    assert simulation.outcome(replace(episode, neighbour_pose=beside)).name == outcome

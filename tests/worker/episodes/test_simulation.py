@@ -43,8 +43,8 @@ def simulation_of(found: Executions, robot: Robot | None = None, fps: float = 15
 @pytest.mark.parametrize("arm", [None, "franka", "ur10e"])
 def test_a_lifted_box_follows_the_hand(arm: str | None) -> None:
     robot, found = read_robot(HAND, arm), executions()
-    episode = simulation_of(found, robot).execute(motion_of(found, robot), 0, 7)
-    assert (episode.outcome, episode.row) == (EpisodeOutcome.SUCCEEDED, 7)
+    episode = simulation_of(found, robot).execute(motion_of(found, robot), 0)
+    assert (episode.outcome, episode.row) == (EpisodeOutcome.SUCCEEDED, 0)
     assert episode.object_pose[-1, 2] - episode.object_pose[0, 2] == pytest.approx(RISE_M, abs=2e-3)
     # From the squeeze on, the box stays where it is in the hand. Critically damped drives lag by about 20 ms.
     held = episode.phase > PHASES.index("squeeze")
@@ -65,7 +65,7 @@ def test_a_lifted_box_follows_the_hand(arm: str | None) -> None:
 )
 def test_friction_and_mass_decide_whether_the_box_rises(change: dict[str, float], outcome: EpisodeOutcome) -> None:
     found = executions(**change)
-    assert simulation_of(found).execute(motion_of(found, Robot(HAND)), 0, 0).outcome is outcome
+    assert simulation_of(found).execute(motion_of(found, Robot(HAND)), 0).outcome is outcome
 
 
 def altered(motion: Motion, name: str) -> Motion:
@@ -86,7 +86,7 @@ def altered(motion: Motion, name: str) -> Motion:
 )
 def test_failures_have_their_reasons_and_repeat(name: str, outcome: EpisodeOutcome) -> None:
     found = executions()
-    episode = simulation_of(found).execute(altered(motion_of(found, Robot(HAND)), name), 0, 0)
+    episode = simulation_of(found).execute(altered(motion_of(found, Robot(HAND)), name), 0)
     assert episode.outcome is outcome and len(episode.state) == len(episode.action) == len(episode.phase)
     again = simulation_of(found).replay(episode)
     assert again.outcome is outcome and np.array_equal(again.state, episode.state)
@@ -95,18 +95,18 @@ def test_failures_have_their_reasons_and_repeat(name: str, outcome: EpisodeOutco
 def test_arms_are_gravity_compensated_and_as_strong_as_their_drives() -> None:
     robot, found = read_robot(HAND, "ur10e"), executions()
     motion = motion_of(found, robot)
-    still = np.repeat(motion.targets[:1], 30, axis=0)
-    states, *_ = simulation_of(found, robot).run(still, still[0], 0)
-    assert np.abs(states - still).max() < 1e-4
+    still = np.repeat(motion.targets[:1], len(motion.time), axis=0)
+    states = simulation_of(found, robot).execute(replace(motion, targets=still), 0).state
+    assert np.abs(states - still[0]).max() < 1e-4
     weak = replace(robot, arm=replace(robot.arm, model=replace(robot.arm.model, effort=np.full(6, 0.2))))
-    assert simulation_of(found, weak).execute(motion, 0, 0).outcome is EpisodeOutcome.NOT_LIFTED
+    assert simulation_of(found, weak).execute(motion, 0).outcome is EpisodeOutcome.NOT_LIFTED
 
 
 @pytest.mark.parametrize("fps", [10.0, 30.0])
 def test_frames_are_at_equal_times_and_the_step_divides_them(fps: float) -> None:
     found = executions()
     simulation, motion = simulation_of(found, fps=fps), motion_of(found, Robot(HAND))
-    episode = simulation.execute(motion, 0, 0)
+    episode = simulation.execute(motion, 0)
     assert episode.outcome is EpisodeOutcome.SUCCEEDED
     assert (len(episode.phase) - 1) / fps == pytest.approx(motion.time[-1], abs=1 / fps)
     assert simulation.scene.model.opt.timestep * simulation.steps * fps == pytest.approx(1)
