@@ -6,7 +6,7 @@ seconds) scales all stored values. A rate's interval is the scatter of batches, 
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Hashable, Iterable
+from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median, quantiles
 from typing import Final
@@ -87,8 +87,9 @@ STORED_IN_SCENE: Final = (1.6, 0.5)
 #: Seconds per valid grasp and perturbed model on two cores (docs/results/robust.md); few tests end early.
 STORED_MODEL_S: Final = 0.018
 STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
-#: Cost of an episode with films of two cameras.
-STORED_EPISODE: Final = StageRate(6.0, 1e6, ORIGIN, 0)
+#: Seconds and bytes of an episode, and of its film by one camera at 320 x 240.
+STORED_EPISODE: Final = (1.0, 16e3)
+STORED_FILM: Final = (2.5, 170e3)
 
 
 class Rates:
@@ -233,19 +234,16 @@ def picture_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Mac
 
 
 def episode_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
-    """Return seconds and bytes per episode, if possible of the same robot and cameras."""
-    found = [batch for batch in batches if batch.count]
-    same = [one for one in found if (one.request.episodes, one.request.film) == (options.episodes, options.film)]
-    counts = [batch.count for batch in same or found]
-    return _stage_rate(same or found, counts, counts, STORED_EPISODE, machine)
+    """Return seconds and bytes per episode of the same robot and cameras."""
+    like = (options.episodes, options.film)
+    found = [one for one in batches if one.count and (one.request.episodes, one.request.film) == like]
+    counts = [batch.count for batch in found]
+    seconds, size = (whole + len(options.film) * film for whole, film in zip(STORED_EPISODE, STORED_FILM, strict=True))
+    return _stage_rate(found, counts, counts, StageRate(seconds, size, ORIGIN, 0), machine)
 
 
 def _stage_rate(
-    batches: list[BatchCost],
-    units: list[float] | list[int],
-    rows: list[float] | list[int],
-    stored: StageRate,
-    machine: Machine,
+    batches: list[BatchCost], units: Sequence[float], rows: Sequence[float], stored: StageRate, machine: Machine
 ) -> StageRate:
     """Return seconds per unit of work and bytes per row of the batches; without rows, the stored rate."""
     if not sum(rows):
