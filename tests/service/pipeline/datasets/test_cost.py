@@ -189,9 +189,6 @@ def test_an_episode_costs_as_stored_then_as_one_of_the_same_robot_and_cameras() 
         BatchCost("h", "o", "cpu", made, seconds, count, count, count, size)
         for seconds, count, size in ((8.0, 4, 40_000), (0.1, 0, 9))
     ]
-        BatchCost("h", "o", "cpu", made, 8.0, 4, 4, 4, 40_000),
-        BatchCost("h", "o", "cpu", made, 0.1, 0, 0, 0, 9),
-    ]
     rates = {
         robot: episode_rate(batches, JobOptions(scene="table", episodes=robot, film=film), Machine(factor=2.0))
         for robot, film in (("flying", ()), ("franka", ("scene", "wrist")))
