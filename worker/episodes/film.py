@@ -76,6 +76,8 @@ _BEHIND_M: Final = (-0.02, 0.02, 0.06)
 _MAP: Final = 400  # edge of a shadow map [samples]
 _FAR_M: Final = 5.0  # distance of lights, beyond all solids [m]
 _SHADOW_M: Final = 0.15  # shadow maps extend so far beyond the motion [m]
+_LIGHT: Final[Any] = Light
+_VIEW: Final[Any] = raster.View
 _AWAY: Final = np.array([0, 0, -50.0, 1, 0, 0, 0])
 
 
@@ -250,8 +252,8 @@ class EpisodeRenderer:
     def _lights(self, middle: Floats, radius: float, rng: Generator) -> list[Any]:
         """Return the lights for `raster.shade`, whose shadow maps show a sphere."""
         lamp, toward = draw_lamp(rng), _direction(rng.uniform(0, 2 * np.pi), rng.uniform(*LAMP))
-        light = Light()
-        for name in Light.vars:
+        light = _LIGHT()
+        for name in _LIGHT.vars:
             setattr(light, name, getattr(lamp, name))
         passes = light_passes(self.options.lights, toward)
         views = _view_structs(np.stack([_camera_pose(middle + _FAR_M * one.toward, middle) for one in passes]))
@@ -345,7 +347,7 @@ def _quat_last(poses: Floats) -> NDArray[np.float32]:
 
 
 def _view_structs(poses: Floats) -> NDArray[Any]:
-    views: NDArray[Any] = np.zeros(len(poses), raster.View.numpy_dtype())
+    views: NDArray[Any] = np.zeros(len(poses), _VIEW.numpy_dtype())
     views["place"], views["inverse"] = _quat_last(poses), _quat_last(invert(poses))
     return views
 

@@ -53,7 +53,10 @@ def films(robot: Robot) -> dict:
 
 
 def test_the_scene_camera_sees_the_object_in_every_frame(robot: Robot, films: dict) -> None:
-    renderer = EpisodeRenderer(robot, MUG, options=replace(OPTIONS, cameras=("scene",)))
+    # The wall hides the mug from every fourth direction or more.
+    wall = Wall(size=(0.02, 0.6, 0.5), pose=(0.2, 0, 0.25, 1, 0, 0, 0))
+    options = replace(OPTIONS, cameras=("scene",))
+    renderer = EpisodeRenderer(robot, MUG, supports=(HalfSpace(), wall), options=options)
     for seed in range(3):
         seen = renderer.film(flight(robot), (seed,))["scene"].segmentation
         assert ((seen == OBJECT).mean(axis=(1, 2)) > 0.004).all()  # 28 of 6912 pixels
