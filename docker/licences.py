@@ -17,7 +17,7 @@ import pin
 
 PAGE: Final = pin.ROOT / "docs" / "reference" / "licences.md"
 #: Extras for users; tools of developers are not distributed.
-EXTRAS: Final = (*pin.EXTRAS, "embedded", "usd", "pandas", "parquet", "arm", "view")
+EXTRAS: Final = (*pin.EXTRAS, "embedded", "usd", "pandas", "parquet", "view")
 #: Permissive licences, and licences whose copyleft is limited to the package itself.
 ACCEPTED: Final = frozenset(
     {"0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "CC0-1.0", "HPND", "ISC", "MIT", "MIT-CMU", "PSF-2.0"}

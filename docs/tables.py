@@ -103,6 +103,7 @@ PARTS: Final[dict[str, Callable[[], str]]] = {
     "base": lambda: schema_table("base"),
     "scene": lambda: schema_table("scene"),
     "views": lambda: schema_table("views"),
+    "episodes": lambda: schema_table("episodes"),
     "options": options_table,
     "settings": settings_table,
     "metrics": series_table,

@@ -11,7 +11,6 @@ from graspd.exchange.inputs import load_case
 from graspd.exchange.plan import ExportSummary
 from graspd.exchange.robots.bundle import Bundle, Carrier
 from graspd.service.model.errors import InputError
-from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.service.store.shards import Shard, read_shard
 from graspd.worker.episodes.execution import (
     ASSUMED_M_S,
@@ -19,13 +18,13 @@ from graspd.worker.episodes.execution import (
     Executions,
     VelocityLimits,
     build_executions,
-    parse_pose,
     straight_paths,
     time_motions,
     tool_frame,
     velocity_limits,
 )
-from graspd.worker.episodes.reach import HandDescription, ReachSearch, read_arm, read_description
+from graspd.worker.episodes.reach import BUILTIN_ARMS, HandDescription, ReachSearch, read_description
+from graspd.worker.episodes.robots import read_robot
 from graspd.worker.files.provenance import hand_files_of_shard
 from graspd.worker.files.subsets import select_grasps
 from graspd.worker.rendering.sheets import best_rows as best_of
@@ -57,8 +56,6 @@ def export_grasps(source: Path, format_: str, wishes: RobotExportOptions, folder
         raise InputError(f"--speed is {wishes.speed:g}; give a share of the velocity limits above 0 and at most 1")
     if wishes.arm is None and (wishes.mount or wishes.base or wishes.mount_pose):
         raise InputError("--mount, --mount-pose and --base need an arm: --arm ARM.urdf")
-    if wishes.arm is not None and not wishes.mount:
-        raise InputError("an arm needs the link that the hand is mounted on: --mount LINK")
     shard = read_shard(source, kind="base")
     files = hand_files_of_shard(shard, wishes.hand)
     description = read_description(files.files, files.options)
@@ -87,10 +84,12 @@ def _plan_for_arm(
     wishes: RobotExportOptions,
     written: ExportSummary,
 ) -> Bundle:
-    assert wishes.arm is not None and wishes.mount is not None
-    base = IDENTITY_POSE if wishes.base is None else parse_pose(wishes.base, "--base")
-    mount_pose = IDENTITY_POSE if wishes.mount_pose is None else parse_pose(wishes.mount_pose, "--mount-pose")
-    arm = read_arm(wishes.arm, wishes.mount, mount_pose)
+    # Poses of an arm from a file have no default but the identity.
+    pose = None if wishes.arm in BUILTIN_ARMS else "0 0 0 1 0 0 0"
+    poses = {"mount_pose": wishes.mount_pose or pose, "base": wishes.base or pose}
+    robot = read_robot(found.hand, wishes.arm, mount=wishes.mount, **poses)
+    arm, base = robot.arm, robot.base
+    assert arm is not None
     reach = ReachSearch(arm, base, found, decompose(found.obj))
     reached = reach.search_all(wishes.best)
     why = ", ".join(f"{count} {reason}" for reason, count in reached.refused.most_common(3))

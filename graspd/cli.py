@@ -28,6 +28,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("transfer", "graspd.commands.transfer", "Make grasps", "Transfer grasps of a file to another hand."),
     ("evaluate", "graspd.commands.evaluate", "Make grasps", "Validate grasps in MuJoCo, an independent engine."),
     ("scene", "graspd.commands.scene", "Make grasps", "Drop the object on a table and select clear grasps."),
+    ("episodes", "graspd.commands.episodes", "Make grasps", "Execute grasps by an arm or a flying hand in MuJoCo."),
     ("render", "graspd.commands.render", "Make grasps", "Render pictures of scenes with labels."),
     ("chart", "graspd.commands.studies", "Make grasps", "Compare speed and accuracy of methods and fidelities."),
     ("bench", "graspd.commands.studies", "Make grasps", "Measure grasps per second and the time of each step."),

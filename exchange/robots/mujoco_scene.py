@@ -177,11 +177,15 @@ def _add_arm_keys(tree: Element, bundle: Bundle, carrier: Carrier) -> None:
     arms = len(carrier.arm.model.joint_names)
     for row, paths in enumerate(carrier.paths):
         ends = [paths[0].joints[0], *(path.joints[-1] for path in paths)]
+        beside = (
+            found.placed.neighbour_pose[found.placed.index[row]] if found.placed and found.placed.neighbours else []
+        )
         for posture, joints in zip(POSTURES, ends, strict=True):
             thing = found.lifted_object_pose[row] if posture == "lift" else found.object_pose[row]
             qpos = np.zeros(world.model.nq)
             qpos[world.arm_qpos], qpos[world.hand_qpos] = joints[:arms], joints[arms:]
-            at = {"mpos": number_text(thing[:3]), "mquat": number_text(thing[3:])}
+            stand = np.stack([thing, *beside])
+            at = {"mpos": number_text(stand[:, :3]), "mquat": number_text(stand[:, 3:])}
             SubElement(keys, "key", {"name": f"{bundle.grasp_name(row)}/{posture}", "qpos": number_text(qpos), **at})
 
 

@@ -14,7 +14,7 @@ from graspd.service.model import names
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
 from graspd.service.model.planning import plan_tasks
 from graspd.service.model.records import JobRecord
-from graspd.service.store.columns import ShardKind
+from graspd.service.store.columns import SCHEMAS, ShardKind
 from graspd.service.store.integrity import check_content, check_file, checked_chunks, missing_error
 from graspd.service.store.manifests import load_manifest
 from graspd.service.store.packs import PACKED, has_packs
@@ -206,5 +206,5 @@ def _shards_of_snapshot(store: Store, dataset: str, digest: str | None) -> Itera
 
 
 def _sort_files(files: Iterable[ShardFile]) -> tuple[ShardFile, ...]:
-    order = list(names.STAGES)
+    order = list(SCHEMAS)
     return tuple(sorted(files, key=lambda file: (file.hand, file.object, file.batch, order.index(file.kind), file.id)))

@@ -8,9 +8,9 @@ from graspd.service.model.engines import ENGINES
 from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspMetric
 
-ShardKind = Literal["base", "scene", "views"]
+ShardKind = Literal["base", "scene", "views", "episodes"]
 #: Version of the columns of each kind. base@1 of graspd 0.2 has other names (`service.model.renamed`).
-_VERSIONS: Final[dict[str, int]] = {"base": 2, "scene": 1, "views": 1}
+_VERSIONS: Final[dict[str, int]] = {"base": 2, "scene": 1, "views": 1, "episodes": 1}
 
 
 def schema_name(kind: str) -> str:
@@ -19,7 +19,7 @@ def schema_name(kind: str) -> str:
 
 @dataclass(frozen=True)
 class Column:
-    """Dataset of a shard. Equal letters in `shape` mean equal lengths in the whole shard."""
+    """Dataset of a shard. Equal letters in `shape` mean equal lengths in the whole shard; `*` is any length."""
 
     shape: str
     dtype: str
@@ -33,6 +33,7 @@ _REST = "share of drops that come to rest on the same face of the convex hull"
 _POSE = "position x y z [m] and unit quaternion w x y z of the hand's root link"
 _NEIGHBOURS = "poses of the neighbours in each scene; names in attribute neighbours"
 _HEIGHT = "height of the lowest point of hand and forearm above the table"
+_STATE = "values of attribute state_names: joints of the arm or pose of the flying hand's root link, dofs of the hand"
 _BOUNDS = "x_min y_min x_max y_max of the"
 _REJECTIONS = "insufficient clearance: 0 none, 1 table at contact, 2 on approach, 3 neighbour at contact, 4 on approach"
 
@@ -54,10 +55,12 @@ def _flag_column(description: str, dtype: str = "i1") -> Column:
     return _optional_column("N", dtype, "bool", "none", description)
 
 
-def _code_column(description: str, shape: str = "N", *, outcomes: Mapping[Any, str] | None = None) -> Column:
+def _code_column(
+    description: str, shape: str = "N", *, outcomes: Mapping[Any, str] | None = None, optional: bool = True
+) -> Column:
     if outcomes:
         description += ", ".join(f"{int(code)} {meaning}" for code, meaning in outcomes.items())
-    return _optional_column(shape, "u1", "enum", "none", description)
+    return Column(shape, "u1", "enum", "none", description, optional)
 
 
 #: Meanings of the codes of a push and of a lift.
@@ -66,8 +69,31 @@ PUSH_OUTCOMES: Final = dict(
 )
 _LIFT_OUTCOMES = ("not tested", "lifted", "penetration", "contact on the approach", "lost while closing", "not lifted")
 LIFT_OUTCOMES: Final = dict(enumerate((*_LIFT_OUTCOMES, "rotated", "diverged", "neighbour moved")))
+#: Meanings of `worker.episodes.episode.EpisodeOutcome`; grasps with the last four were not executed.
+_EPISODE_OUTCOMES = ("succeeded", "touched", "not lifted", "dropped", "diverged", "out of reach")
+EPISODE_OUTCOMES: Final = dict(enumerate((*_EPISODE_OUTCOMES, "no continuous motion", "collision", "no transit")))
+EXECUTED: Final = _EPISODE_OUTCOMES[:5]
+#: Meanings of the codes of phases, `worker.episodes.episode.PHASES`.
+_PHASES = ("transit", "approach", "shape", "close", "squeeze", "lift", "hold")
+EPISODE_PHASES: Final = dict(enumerate(_PHASES))
+#: Cameras that film episodes.
+CAMERAS: Final = ("scene", "wrist", "moving")
+#: Videos of each camera.
+VIDEOS: Final = {camera: (camera, f"{camera}_depth", f"{camera}_segmentation") for camera in CAMERAS}
 
 _BITS: Final = ", ".join(f"{1 << bit} {name}" for bit, name in enumerate(ENGINES))
+
+
+def _camera_columns(camera: str) -> dict[str, Column]:
+    columns = {
+        f"camera/{camera}_pose": _optional_column("F 7", "f4", "m, 1", "scene", "camera: x right, y down, z forward")
+    }
+    for name, about in zip(
+        VIDEOS[camera], ("AV1 in MP4", "16-bit FFV1, depth [mm]", "8-bit FFV1, labels"), strict=True
+    ):
+        columns[f"video/{name}"] = _optional_column("*", "u1", "bytes", "none", f"videos in sequence: {about}")
+        columns[f"video/{name}_bytes"] = _optional_column("E", "i8", "bytes", "none", "size of each video")
+    return columns
 
 
 def _wrist_column(rows: str) -> Column:
@@ -168,6 +194,25 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "image/rgb_hand": _optional_column("V H W 3", "u1", "sRGB", "image", "colour with the hand at its grasp"),
         "camera/hand_grasp": _optional_column("V", "i4", "1", "none", "row of the grasp in the scene shard; -1: none"),
     },
+    "episodes": {
+        "episode/row": Column("E", "i4", "1", "none", "row of the grasp in the base shard"),
+        "episode/scene_index": Column("E", "i4", "1", "none", "row of the grasp's scene in /scene"),
+        "episode/outcome": _code_column("outcome: ", "E", outcomes=EPISODE_OUTCOMES, optional=False),
+        "episode/frames": Column("E", "i4", "1", "none", "number of frames; 0: not executed"),
+        "frame/state": Column("F D", "f4", "m, 1, rad", "scene", f"measured state, {_STATE}"),
+        "frame/action": Column("F D", "f4", "m, 1, rad", "scene", f"state commanded for the next frame, {_STATE}"),
+        "frame/phase": _code_column("phase: ", "F", outcomes=EPISODE_PHASES, optional=False),
+        "frame/object_pose": Column("F 7", "f4", "m, 1", "scene", "object frame"),
+        "frame/neighbour_pose": _optional_column("F M 7", "f4", "m, 1", "scene", "frames of the neighbours"),
+        "scene/object_pose": Column("S 7", "f8", "m, 1", "scene", "object frame at rest; z points up"),
+        "scene/neighbour_pose": _optional_column("S M 7", "f8", "m, 1", "scene", _NEIGHBOURS),
+        **{
+            one.path: _optional_column("E", "i4" if one.whole else "f8", one.units, "none", one.meaning)
+            for one in GRASP_METRICS
+            if one.optional and not one.swept
+        },
+        **{path: column for camera in CAMERAS for path, column in _camera_columns(camera).items()},
+    },
 }
 
 Attribute = str | int | float | list[str]
@@ -178,14 +223,16 @@ class RootAttribute:
     type: str
     """text, integer, number or texts."""
     description: str
-    kinds: tuple[str, ...] = ("base", "scene", "views")
+    kinds: tuple[str, ...] = ("base", "scene", "views", "episodes")
 
 
 _TYPES: Final[dict[str, Any]] = {"text": str, "integer": int, "number": int | float, "texts": list}
 _BASE: Final = ("base",)
+_EXECUTED: Final = ("base", "episodes")
+_EPISODES: Final = ("episodes",)
 
 ATTRIBUTES: Final[dict[str, RootAttribute]] = {
-    "schema": RootAttribute("text", "`graspd/base@2`, `graspd/scene@1` or `graspd/views@1`"),
+    "schema": RootAttribute("text", "`graspd/base@2`, `graspd/scene@1`, `graspd/views@1` or `graspd/episodes@1`"),
     "hand": RootAttribute("text", "name of the hand"),
     "hand_digest": RootAttribute("text", "digest of the hand's files"),
     "hand_source": RootAttribute("text", "path from which a local command read the hand; absent: built in"),
@@ -193,8 +240,8 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "object_digest": RootAttribute("text", "digest of the object's files"),
     "object_source": RootAttribute("text", "path from which a local command read the object; absent: built in"),
     "object_options": RootAttribute("text", "options for reading the mesh, as JSON"),
-    "object_mass_kg": RootAttribute("number", "mass of the object in simulation [kg]", _BASE),
-    "object_friction": RootAttribute("number", "Coulomb coefficient of the object's contacts in simulation", _BASE),
+    "object_mass_kg": RootAttribute("number", "mass of the object in simulation [kg]", _EXECUTED),
+    "object_friction": RootAttribute("number", "Coulomb coefficient of the object's contacts in simulation", _EXECUTED),
     "object_scale": RootAttribute("number", "imported grasps: scale of the object's mesh", _BASE),
     "method": RootAttribute("text", "planner"),
     "fidelity": RootAttribute("text", "settings of the fidelity, as JSON"),
@@ -216,7 +263,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "outcomes": RootAttribute("text", "JSON: rejected candidates by outcome", _BASE),
     "reason": RootAttribute("text", "why a command found fewer grasps than requested; absent: none are missing", _BASE),
     "grasps_wanted": RootAttribute("integer", "number of requested grasps, if the command was interrupted", _BASE),
-    "requirements": RootAttribute("text", "JSON: required type, digits, region and approach; absent: none", _BASE),
+    "requirements": RootAttribute("text", "JSON: required type, digits, region and approach; absent: none", _EXECUTED),
     "robust": RootAttribute("text", "JSON: perturbed models per valid grasp, required share; absent: none", _BASE),
     "engines": RootAttribute("text", "engines of `quality/held_in`, separated by commas; absent: none", _BASE),
     "verdict_level": RootAttribute("text", "level of validation; `none`: not validated", _BASE),
@@ -225,11 +272,20 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "transferred_from": RootAttribute("text", "JSON: shard and rows that the grasps were transferred from", _BASE),
     "source": RootAttribute("text", "imported grasps: address or citation of the source", _BASE),
     "licence": RootAttribute("text", "imported grasps: terms of use", _BASE),
-    "base_shard": RootAttribute("text", "base shard of the grasps in the scenes", ("scene", "views")),
-    "scene_shard": RootAttribute("text", "scene shard of the grasps or pictures", ("base", "views")),
+    "base_shard": RootAttribute("text", "base shard of the grasps in the scenes", ("scene", "views", "episodes")),
+    "scene_shard": RootAttribute("text", "scene shard of the grasps or pictures", ("base", "views", "episodes")),
     "neighbours": RootAttribute("texts", "names of the neighbours"),
     "neighbour_digests": RootAttribute("texts", "digests of the neighbours' files"),
     "neighbour_sources": RootAttribute("texts", "paths from which a local command read neighbours; empty: built in"),
+    "state_names": RootAttribute("texts", "order of the values of states and actions", _EPISODES),
+    "fps": RootAttribute("number", "frames per second", _EPISODES),
+    "arm": RootAttribute("text", "name of the arm; absent: the hand flies", _EPISODES),
+    "arm_digest": RootAttribute("text", "digest of the arm's files", _EPISODES),
+    "arm_source": RootAttribute("text", "path from which a local command read the arm; absent: built in", _EPISODES),
+    "arm_mount": RootAttribute("text", "link of the arm that carries the hand", _EPISODES),
+    "arm_mount_pose": RootAttribute("text", "pose of the hand's root link in the frame of this link", _EPISODES),
+    "arm_base": RootAttribute("text", "pose of the arm's root link in the scene", _EPISODES),
+    "cameras": RootAttribute("text", "JSON: size, intrinsics and codec of each camera; absent: none", _EPISODES),
 }
 
 

@@ -80,7 +80,7 @@ def check_columns(kind: ShardKind, arrays: Arrays) -> dict[str, int]:
             raise InputError(f"{path} has {array.ndim} axes; the schema says ({', '.join(letters)})")
         for letter, length in zip(letters, array.shape, strict=True):
             expected = int(letter) if letter.isdigit() else lengths.setdefault(letter, length)
-            if expected != length:
+            if expected != length and letter != "*":
                 raise InputError(f"{path}: axis {letter} has length {length}, expected {expected}")
     return lengths
 
@@ -104,7 +104,9 @@ def read_shard(
     with open_shard(source, name=name) as file:
         found = shard_kind(file, name)
         if kind is not None and found != kind:
-            raise InputError(f"{name} is a {found} shard; a {kind} shard is needed here")
+            raise InputError(
+                f"{name} is a {found} shard; a {kind} shard is needed here".replace("a episodes", "an episodes")
+            )
         arrays = {p: read_column(file, p, name) for p in SCHEMAS[found] if p in file and p not in without}
         attributes = {k: _decode_attribute(v) for k, v in file.attrs.items()}
     return Shard(found, attributes, arrays, None if isinstance(source, bytes) else source)

@@ -1,6 +1,7 @@
 """Episodes: motions of an arm with a hand, or of a flying hand, executed with one grasp each."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final
 
@@ -22,9 +23,9 @@ class EpisodeOutcome(IntEnum):
     """Outcome of an episode. Codes above `DIVERGED` are reasons why a grasp was not executed."""
 
     SUCCEEDED = 0
-    TOUCHED = 1  # the object or a neighbour was moved before the hand closed
+    TOUCHED = 1  # the object was moved before the hand closed, or a neighbour at any time
     NOT_LIFTED = 2
-    DROPPED = 3
+    DROPPED = 3  # after a rise, or displaced or rotated in the hand beyond the limits of the lift test
     DIVERGED = 4
     OUT_OF_REACH = 5
     NO_CONTINUOUS_MOTION = 6
@@ -38,7 +39,7 @@ class Robot:
 
     hand: HandModel
     arm: Arm | None = None
-    base: Floats = IDENTITY_POSE  # (7,) pose of the arm's root link in the scene
+    base: Floats = field(default_factory=IDENTITY_POSE.copy)  # (7,) pose of the arm's root link in the scene
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -60,7 +61,8 @@ class Robot:
 
 @dataclass(frozen=True)
 class Episode:
-    """One executed grasp, T frames at equal times; without frames if it was not executed."""
+    """One executed grasp, T frames at equal times; without frames if it was not executed.
+    Numbers have the precision of float32, as in files."""
 
     row: int  # row of the grasp in its shard
     scene: int
@@ -68,4 +70,8 @@ class Episode:
     phase: NDArray[np.uint8]  # (T,) indices of `PHASES`
     state: Floats  # (T, D) measured, in the order of `Robot.names` [m, 1, rad]
     action: Floats  # (T, D) commanded from this frame to the next
-    object_pose: Floats  # (T, 7) in the scene
+    object_pose: Floats = field(default_factory=lambda: np.zeros((0, 7)))  # (T, 7) in the scene
+    neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))  # (T, M, 7) in the scene
+    videos: Mapping[str, bytes] = field(default_factory=dict)  # video of each of `columns.VIDEOS`
+    camera_pose: Mapping[str, Floats] = field(default_factory=dict)
+    """(T, 7) pose of each camera in the scene: x right, y down, z forward."""

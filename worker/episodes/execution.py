@@ -104,7 +104,7 @@ def build_executions(
     placed_parts = (Posture(compose(at, part.hand_pose), part.joint_positions) for part in parts)
     postures = dict(zip(POSTURES, placed_parts, strict=True))
     whole = Executions(hand, obj, tool, frame, np.asarray(rows, np.intp), at, postures, placed, dict(quality))
-    if not free.any():
+    if len(grasps) and not free.any():
         raise InputError(f"none of {len(grasps)} grasps has a free straight approach of {100 * STANDOFF_M:.0f} cm")
     return whole.take(np.flatnonzero(free))
 
@@ -116,6 +116,7 @@ def posed_bodies(found: Executions, posture: str, row: int) -> Floats:
 
 
 _SLACK = 1e-2  # tolerance of a quaternion's length around 1
+_EXACT = 1e-12  # error of a unit quaternion by rounding; such a pose is unchanged
 
 
 def parse_pose(text: str, what: str) -> Floats:
@@ -130,7 +131,8 @@ def parse_pose(text: str, what: str) -> Floats:
     length = float(np.linalg.norm(values[3:]))
     if abs(length - 1.0) > _SLACK:
         raise InputError(f"{what}: the quaternion qw qx qy qz has length {length:.3g}; it must be 1")
-    values[3:] /= length
+    if abs(length - 1.0) > _EXACT:
+        values[3:] /= length
     return values
 
 

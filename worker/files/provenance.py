@@ -238,9 +238,10 @@ def _load_neighbour(shard: Shard, name: str, digest: str, source: str) -> Object
 
 
 def scenes_of_shard(shard: Shard) -> PlacedGrasps | None:
-    """Return the scenes of a base shard's grasps; None if they were planned around a free object.
+    """Return the scenes of a base shard's grasps or of episodes; None if planned around a free object.
     Raises InputError: the shard's scene attribute is invalid."""
-    if "scene/object_pose" not in shard.arrays or "grasp/scene_index" not in shard.arrays:
+    index = shard.arrays.get("grasp/scene_index", shard.arrays.get("episode/scene_index"))
+    if "scene/object_pose" not in shard.arrays or index is None:
         return None
     if (spec := scene_spec_of(shard)) is None:
         raise InputError("the shard has grasps in scenes, but its attribute scene does not say which")
@@ -248,7 +249,7 @@ def scenes_of_shard(shard: Shard) -> PlacedGrasps | None:
     if (beside := neighbours_of_shard(shard, [])) is not None:
         neighbours = tuple(neighbour_of(other) for other in beside.objects)
         scenes = replace(scenes, neighbours=neighbours, neighbour_pose=beside.poses)
-    return scenes.placed(np.asarray(shard["grasp/scene_index"], np.intp))
+    return scenes.placed(np.asarray(index, np.intp))
 
 
 def check_wrist_poses(shard: Shard, hand: str, obj: str, options: Mapping[str, Any]) -> None:

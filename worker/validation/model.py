@@ -3,7 +3,7 @@ The object's body frame is at its centre of mass."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -135,9 +135,10 @@ def build_scene(
     physics: MujocoOptions,
     supports: Sequence[Obstacle] = (),
     neighbours: Sequence[Neighbour] = (),
+    carrier: Callable[[Any], Any] | None = None,
 ) -> Scene:
-    """Compile the scene of a hand and an object, with supports and neighbours, if any."""
-    model = scene_spec(hand, obj, pieces, physics, supports, neighbours).compile()
+    """Compile the scene of a hand and an object, with supports and neighbours, if any; see `scene_spec`."""
+    model = scene_spec(hand, obj, pieces, physics, supports, neighbours, carrier).compile()
     if model.nv >= SPARSE:
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
     lead = hand.joint_body[hand.first_joint]
@@ -156,7 +157,7 @@ def build_scene(
         hand_geoms=np.asarray((body_of_geom != object_body) & ~support),
         object_body=object_body,
         object_qpos=int(model.joint("object").qposadr[0]),
-        root_qpos=int(model.joint("root").qposadr[0]) if physics.root == "weld" else -1,
+        root_qpos=int(model.joint("root").qposadr[0]) if physics.root == "weld" and carrier is None else -1,
         joint_qpos=np.array([int(model.joint(f"joint{b}").qposadr[0]) for b in hand.joint_body], np.intp),
         dof_gain=hand.multiplier[lead],
         dof_shift=hand.offset[lead],
@@ -201,15 +202,18 @@ def scene_spec(
     physics: MujocoOptions,
     supports: Sequence[Obstacle] = (),
     neighbours: Sequence[Neighbour] = (),
+    carrier: Callable[[Any], Any] | None = None,
 ) -> Any:
     """Return the spec that `build_scene` compiles.
+    `carrier` adds an arm to the spec and returns the hand's root body on it; without it, see `MujocoOptions.root`.
     Names: `body0` ..., `joint1` ..., `dof0` ... (actuators), object, supports, `neighbour0` ..."""
     spec = empty_spec(physics.timestep)
     spec.option.noslip_iterations = physics.noslip_iterations
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | (NOT_IN_3_3_2 & ~multi_contact_flags(hand))
     slide, twist = (coefficient * obj.friction / SLIDING for coefficient in physics.friction)
     friction = [slide, twist, 1e-4]
-    _add_hand(spec, hand, friction, physics.root)
+    base = _add_root(spec, physics.root) if carrier is None else carrier(spec)
+    add_hand(spec, base, hand, {"condim": 4, "friction": friction, "solimp": HAND_SOLIMP, "solref": HAND_SOLREF})
     add_object(spec, obj, pieces.vertices, friction, obj.mass)
     if supports:
         # The scene's pose in the object frame is that of this mocap body.
@@ -227,18 +231,17 @@ def multi_contact_flags(hand: HandModel) -> int:
     return int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) if jaws_of(hand) is not None else 0
 
 
-def _add_hand(spec: Any, hand: HandModel, friction: list[float], root: str) -> None:
-    if root == "weld":
-        spec.worldbody.add_body(name="mocap", mocap=True)
-        base = spec.worldbody.add_body(name="body0")
-        base.add_freejoint(name="root")
-        spec.add_equality(
-            type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="mocap", name2="body0",
-            solimp=[0.9, 0.95, 0.001, 0.5, 2.0], data=equality_data(0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1),
-        )  # fmt: skip
-    else:
-        base = spec.worldbody.add_body(name="body0", mocap=True)
-    add_hand(spec, base, hand, {"condim": 4, "friction": friction, "solimp": HAND_SOLIMP, "solref": HAND_SOLREF})
+def _add_root(spec: Any, root: str) -> Any:
+    if root != "weld":
+        return spec.worldbody.add_body(name="body0", mocap=True)
+    spec.worldbody.add_body(name="mocap", mocap=True)
+    base = spec.worldbody.add_body(name="body0")
+    base.add_freejoint(name="root")
+    spec.add_equality(
+        type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY, name1="mocap", name2="body0",
+        solimp=[0.9, 0.95, 0.001, 0.5, 2.0], data=equality_data(0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1),
+    )  # fmt: skip
+    return base
 
 
 def add_hand(spec: Any, base: Any, hand: HandModel, contact: dict[str, Any]) -> None:

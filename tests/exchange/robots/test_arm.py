@@ -1,7 +1,6 @@
 """An arm that carries the hand: it is where the hand should be, within its limits, and runs into nothing."""
 
 import re
-import sys
 from pathlib import Path
 
 import mujoco
@@ -20,8 +19,6 @@ MOUNT_POSE = "0 0 0.11 1 0 0 0"
 #: The search ends at 0.1 mm and 1 mrad; between two of its points, 5 mm apart, joints move straight.
 NEAR_M = 5e-4
 NAMES = [name for name, *_ in JOINTS]
-
-pytest.importorskip("mink")
 
 
 @pytest.fixture(scope="module")
@@ -110,11 +107,11 @@ def test_an_arm_that_cannot_is_refused_in_a_line(options, said: str, free_shard:
     assert re.search(said, told) and not (tmp_path / "out").exists()
 
 
-def test_base_without_an_arm_and_an_arm_without_mink_are_refused(free_shard, arm: Path, tmp_path, monkeypatch) -> None:
+def test_base_without_an_arm_and_an_arm_that_is_unknown_are_refused(free_shard, tmp_path) -> None:
     words = "export --format csv"
     assert "--arm ARM.urdf" in refused(words, free_shard, "--base", "0 0 0 1 0 0 0", "-o", tmp_path)
-    monkeypatch.setitem(sys.modules, "mink", None)
-    assert "pip install 'graspd[arm]'" in refused(f"{words} --mount flange --arm", arm, free_shard, "-o", tmp_path)
+    said = refused(f"{words} --arm ur10", free_shard, "-o", tmp_path)
+    assert "neither a file nor a built-in arm (franka, ur10e); did you mean ur10e?" in said
 
 
 def test_speeds_that_the_arm_does_not_state_are_assumed_and_told(free_shard: Path, tmp_path: Path) -> None:
