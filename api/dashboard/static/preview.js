@@ -9,15 +9,16 @@ async function show(figure) {
   figure.dataset.shown = address;
   figure.dataset.state = address ? "loading" : "none";
   try {
-    const made = address && figureOf(await loadGlb(address));
+    const model = address && await loadGlb(address);
     if (figure.dataset.model !== address) return;
     const stage = figure.stage ??= new LiveStage(figure.querySelector("canvas"));
     // An old model must not look like the selected one.
-    stage.shown?.removeFromParent();
+    stage.shown?.setParent(null);
     stage.invalidate();
-    if (!made) return;
+    if (!model) return;
+    const made = figureOf(stage, model);
     stage.shown = made.group;
-    stage.scene.add(made.group);
+    made.group.setParent(stage.scene);
     stage.frame(made.group, beforePalm(made), 1.0);
     said.textContent = "";
     figure.dataset.state = "ready";
