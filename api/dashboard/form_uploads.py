@@ -65,14 +65,19 @@ class AssetChoice:
     refused: Refusal | None = None
     file: str = ""
     held: str = ""
-    """Digest of the refused file in the store; if empty, the user must choose the file again."""
+    """Digest of the file in the store; if empty, the user must choose the file again."""
+    message: str = ""
+    """Result of the check of an accepted file."""
+    shown_in: str = ""
+    """Unit in which the 3D view shows a refused file; empty: there is no view."""
 
     def form_field(self, kind: AssetKind) -> str:
         return FILE_FIELDS[kind] if self.file else kind.value
 
 
 def choose_asset(request: Request, assets: Assets, fields: FormData, kind: AssetKind) -> AssetChoice:
-    """Return the hand or object of a submitted form: an uploaded file, a known asset, or the refused file."""
+    """Return the hand or object of a submitted form: an uploaded file, the file that the form refers to, or a known
+    asset."""
     file, known = fields.get(FILE_FIELDS[kind]), _field_text(fields, kind.value)
     if isinstance(file, UploadFile) and file.filename:
         try:
@@ -80,13 +85,15 @@ def choose_asset(request: Request, assets: Assets, fields: FormData, kind: Asset
         except InputError as error:
             return AssetChoice(refused=Refusal(str(error)), file=file.filename)
         return _wait_for_check(assets, asset)
-    if known:
-        return AssetChoice(name=known)
     if held := _field_text(fields, f"{kind.value}_held"):
         try:
-            return _wait_for_check(assets, _retry_upload(assets, kind, held, fields))
+            before = assets.get(kind, held)
+            if known in ("", before.name):
+                return _wait_for_check(assets, _retry_upload(assets, before, fields))
         except InputError as error:
             return AssetChoice(refused=Refusal(str(error)), file=held, held=held)
+    if known:
+        return AssetChoice(name=known)
     return AssetChoice(refused=Refusal(f"select a known {kind.value}, or a file"))
 
 
@@ -136,11 +143,12 @@ def _store_upload(request: Request, assets: Assets, kind: AssetKind, file: Uploa
     return store_upload(assets, kind, file, None, limit_bytes=limit, options=options, rename=True)
 
 
-def _retry_upload(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
-    """Store the refused file again, with the options of the pressed button or with changed units."""
-    before, said = assets.get(kind, digest), fix_options(fields, kind)
-    if not said and kind is AssetKind.OBJECT and (units := _chosen_unit(fields)) != _field_text(fields, "held_units"):
-        said = {"units": units}
+def _retry_upload(assets: Assets, before: AssetView, fields: FormData) -> AssetView:
+    """Store the file again, with the options of the pressed button or with changed units."""
+    kind = before.kind
+    if not (said := fix_options(fields, kind)) and kind is AssetKind.OBJECT:
+        units = _chosen_unit(fields)
+        said = {"units": units} if units != _field_text(fields, "held_units") else {}
     if not said:
         return before
     files = assets.files(before)
@@ -172,8 +180,10 @@ def _wait_for_check(assets: Assets, asset: AssetView) -> AssetChoice:
         time.sleep(0.2)
         asset = assets.get(asset.kind, asset.digest)
     if asset.verdict == "refuse":
-        return AssetChoice(refused=refusal_of(asset), file=asset.name, held=asset.digest)
-    return AssetChoice(name=asset.name)
+        first = str(next(iter(_list_entries(asset.facts, "units_suggested")), ""))
+        return AssetChoice("", refusal_of(asset), asset.name, asset.digest, shown_in=dict(UNITS).get(first, ""))
+    unchecked = "No worker has checked it yet; start one before you submit."
+    return AssetChoice(asset.name, held=asset.digest, message=(asset.message or "") if asset.verdict else unchecked)
 
 
 def select_choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> list[tuple[str, str]]:
@@ -198,6 +208,12 @@ def asset_choices(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
 
 def _field_text(fields: FormData, name: str) -> str:
     return value if isinstance(value := fields.get(name), str) else ""
+
+
+def shown_unit(fields: FormData) -> str:
+    """Return the unit of the pressed button, else the chosen one."""
+    fix = _field_text(fields, f"{AssetKind.OBJECT.value}_fix")
+    return next((unit for unit, _ in UNITS if fix == json.dumps({"units": unit})), _chosen_unit(fields))
 
 
 def _chosen_unit(fields: FormData) -> str:
