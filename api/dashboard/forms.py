@@ -129,7 +129,7 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
     refused = {one.form_field(kind): one.refused.problem for kind, one in things.items() if one.refused}
     if any(fields.get(f"{kind.value}_fix") for kind in FILE_FIELDS):
         # A chosen file or the button of a fix only shows its result; the submit button submits.
-        return _render_form(request, assets, shown, things=things, errors=refused, status=422 if refused else 200)
+        return _render_form(request, assets, shown, things=things, errors=refused)
     started = timestamp()
     try:
         named = {kind.value: one.name or "unnamed" for kind, one in things.items()}

@@ -51,15 +51,14 @@ export class DistanceField {
   }
 
   #insert(face) {
-    const end = (axis, way) => Math.floor(way * (Math.max(...[face.a, face.b, face.c].map((p) => way * p[axis])) + FIELD_M) / FIELD_M);
-    const [x, y, z] = [0, 1, 2].map((axis) => [end(axis, -1), end(axis, 1)]);
-    for (let i = x[0]; i <= x[1]; i++) {
-      for (let j = y[0]; j <= y[1]; j++) {
-        for (let k = z[0]; k <= z[1]; k++) {
-          const cell = key(i, j, k);
-          if (this.cells.has(cell)) this.cells.get(cell).push(face); else this.cells.set(cell, [face]);
-        }
-      }
+    const [x, y, z] = [0, 1, 2].map((axis) => {
+      const at = [face.a, face.b, face.c].map((corner) => corner[axis]);
+      const first = Math.floor((Math.min(...at) - FIELD_M) / FIELD_M), last = Math.floor((Math.max(...at) + FIELD_M) / FIELD_M);
+      return Array.from({ length: last - first + 1 }, (_, n) => first + n);
+    });
+    for (const i of x) for (const j of y) for (const k of z) {
+      const cell = key(i, j, k);
+      if (this.cells.has(cell)) this.cells.get(cell).push(face); else this.cells.set(cell, [face]);
     }
   }
 }

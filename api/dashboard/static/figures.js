@@ -76,8 +76,7 @@ export class Hand {
 
   /** Show collision shapes instead of visual meshes. */
   setCollision(on) {
-    for (const { shown, collision } of this.bodies) {
-      if (!collision) continue;
+    for (const { shown, collision } of this.bodies.filter((body) => body.collision)) {
       collision.visible = on;
       if (shown) shown.visible = !on;
     }
@@ -131,10 +130,6 @@ export function mixPoses([ax, ay, az, aw, ai, aj, ak], [bx, by, bz, bw, bi, bj, 
 
 /** Interpolate two postures, 0 to 1. */
 export function between(first, second, share, names) {
-  const positions = {};
-  names.forEach((name, i) => {
-    const [a, b] = [first.joint_positions[i], second.joint_positions[i]];
-    positions[name] = a + (b - a) * share;
-  });
-  return { pose: mixPoses(first.hand_pose, second.hand_pose, share), positions };
+  const mix = (i) => first.joint_positions[i] * (1 - share) + second.joint_positions[i] * share;
+  return { pose: mixPoses(first.hand_pose, second.hand_pose, share), positions: Object.fromEntries(names.map((name, i) => [name, mix(i)])) };
 }

@@ -1,11 +1,11 @@
 // Views of grasps, one or several side by side: hand, object and scene in 3D, contacts coloured by distance, and a
 // slider along the trajectory, planned or replayed in MuJoCo. Several views turn and move together.
-import { Vec3 } from "./vendor/ogl.min.js";
+import { Transform } from "./vendor/ogl.min.js";
 import { loadGlb } from "./glb.js";
-import { groupOf, Hand, place, Thing } from "./figures.js";
+import { Hand, place, Thing } from "./figures.js";
 import { Contacts } from "./contacts.js";
 import { Forces } from "./forces.js";
-import { Arrow, AXES } from "./marks.js";
+import { AXES, drawArrows } from "./marks.js";
 import { freeSide, staged } from "./scenery.js";
 import { besideHand, LiveStage, startViewers } from "./stage.js";
 import { Way } from "./way.js";
@@ -44,11 +44,8 @@ class View {
     scenery?.group.setParent(this.stage.scene);
     scenery?.addNeighbours(grasp.scene);
     this.contacts = new Contacts(this.stage, this.hand, this.thing);
-    this.axes = groupOf(...AXES.map((color, k) => {
-      const arrow = new Arrow(this.stage, color);
-      arrow.place([0, 0, 0], [0, 1, 2].map((axis) => Number(axis === k)), 0.05);
-      return arrow.group;
-    }));
+    this.axes = new Transform();
+    drawArrows(this.stage, this.axes, AXES.map((color, k) => [color, [0, 0, 0], [0, 1, 2].map((axis) => Number(axis === k)), 0.05]));
     for (const part of [this.contacts.group, this.axes]) part.setParent(this.thing.group);
     this.planned = new Way(grasp.way, grasp.joint_names);
     this.follow(this.planned, this.planned.place("grasp"));
@@ -167,7 +164,7 @@ class View {
     if (at) this.show(Number(at));
     this.slider.addEventListener("input", () => this.move(Number(this.slider.value)));
     this.find("[data-play]").addEventListener("click", () => this.play());
-    this.find("[data-reset]").addEventListener("click", () => this.stage.reset());
+    this.find("[data-reset]").addEventListener("click", () => { this.stage.view = this.stage.home; });
     this.find("[data-link]")?.addEventListener("click", (event) => this.link(event.target));
     this.stage.onTurn = (view) => others(this, (one) => { one.stage.view = view; });
   }

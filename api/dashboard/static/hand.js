@@ -36,16 +36,12 @@ class HandPage {
     return this.form.elements[name];
   }
 
-  number(name) {
-    return Number(this.field(name).value) || 0;
-  }
-
   closing() {
     return this.dofs.map((_, i) => Number(this.field(`closing.${i}`).value));
   }
 
   preshape() {
-    return this.dofs.map((_, i) => this.number(`preshape.${i}`));
+    return this.dofs.map((_, i) => Number(this.field(`preshape.${i}`).value) || 0);
   }
 
   limits(i) {
@@ -77,7 +73,7 @@ class HandPage {
   }
 
   vector(name, scale = 1) {
-    return new Vec3(...["x", "y", "z"].map((axis) => scale * this.number(`${name}_${axis}`)));
+    return new Vec3(...["x", "y", "z"].map((axis) => scale * Number(this.field(`${name}_${axis}`).value)));
   }
 
   write(name, vector, scale, digits) {
@@ -101,7 +97,7 @@ class HandPage {
 
   show() {
     const { centre, approach } = this.palm();
-    this.marks.approach.group.visible = approach !== null;
+    this.marks.palm.visible = approach !== null;
     if (approach) this.marks.placePalm(centre, approach);
     const chosen = new Set([...this.form.querySelectorAll("[name=fingertip]:checked")].map((box) => box.value));
     const tips = this.hand.bodies.filter((body) => chosen.has(body.name));
@@ -109,7 +105,7 @@ class HandPage {
     this.pose(closer);
     const after = tips.map((body) => this.spot(body));
     this.pose(this.q);
-    this.marks.placeClosing(tips.map((body, i) => [body.name, this.spot(body), after[i]]));
+    this.marks.placeClosing(tips.map((body, i) => [this.spot(body), after[i]]));
     this.dofs.forEach((_, i) => {
       const slider = this.form.querySelector(`[data-joint="${i}"]`);
       slider.value = String(this.q[i]);
@@ -151,14 +147,17 @@ class HandPage {
     this.show();
   }
 
+  /** Write a joint's value into the form, as its pre-shape. */
+  keep(i) {
+    this.field(`preshape.${i}`).value = String(Number(this.q[i].toFixed(6)));
+  }
+
   /** Set the pre-shape of a joint after a change of its closing direction. */
   turn(i) {
     const [low, high] = this.limits(i);
-    const share = this.dofs.length <= GRIPPER_DOFS ? 0 : PRESHAPE_SHARE;
-    const way = this.closing()[i];
-    const value = way === 0 ? Math.min(Math.max(0, low), high) : way > 0 ? low + share * (high - low) : high - share * (high - low);
-    this.field(`preshape.${i}`).value = String(Number(value.toFixed(6)));
-    this.q[i] = value;
+    const shaped = this.posture(this.dofs.length <= GRIPPER_DOFS ? 0 : PRESHAPE_SHARE)[i];
+    this.q[i] = this.closing()[i] === 0 ? Math.min(Math.max(0, low), high) : shaped;
+    this.keep(i);
     this.show();
   }
 
@@ -170,10 +169,7 @@ class HandPage {
     every("[name=palm_link]", "change", () => this.movePalm());
     every("[name^='centre_'], [name^='approach_'], [name=fingertip]", "input", () => this.show());
     every("[data-approach]", "click", (button) => { this.write("approach", new Vec3(...button.dataset.approach.split(",").map(Number)), 1, 0); this.show(); });
-    every("[data-take]", "click", () => {
-      this.q.forEach((value, i) => { this.field(`preshape.${i}`).value = String(Number(value.toFixed(6))); });
-      this.show();
-    });
+    every("[data-take]", "click", () => { this.dofs.forEach((_, i) => this.keep(i)); this.show(); });
     const postures = { open: () => this.posture(0), preshape: () => this.preshape(), closed: () => this.posture(1) };
     for (const button of this.figure.querySelectorAll("[data-posture]")) {
       button.addEventListener("click", () => this.take(postures[button.dataset.posture]()));
@@ -182,7 +178,7 @@ class HandPage {
     const toggles = {
       housing: (on) => this.hand.setGlass(on, this.hand.housing),
       collision: (on) => this.hand.setCollision(on),
-      marks: (on) => this.marks.setVisible(on),
+      marks: (on) => this.marks.groups.forEach((group) => { group.visible = on; }),
     };
     for (const [name, apply] of Object.entries(toggles)) {
       const box = this.figure.querySelector(`[data-toggle=${name}]`);
@@ -191,7 +187,7 @@ class HandPage {
       box.addEventListener("change", change);
       change();
     }
-    this.figure.querySelector("[data-reset]").addEventListener("click", () => this.stage.reset());
+    this.figure.querySelector("[data-reset]").addEventListener("click", () => { this.stage.view = this.stage.home; });
     for (const hidden of document.querySelectorAll("[data-moves]")) hidden.hidden = false;
   }
 }

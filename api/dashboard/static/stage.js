@@ -6,6 +6,8 @@ import { boundsOf } from "./shapes.js";
 const FIELD_DEG = 32;
 const SLOPE = Math.tan((FIELD_DEG * Math.PI) / 360);
 const TURN = Math.PI / 24;
+const TURNS = { ArrowLeft: [-TURN, 0], ArrowRight: [TURN, 0], ArrowUp: [0, -TURN], ArrowDown: [0, TURN] };
+const ZOOMS = { "+": 0.88, "=": 0.88, "-": 1.14 };
 const UP = new Vec3(0, 0, 1);
 /** Lengths of the scale bar [m], and its greatest length [pixels]. */
 const SCALES_M = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5];
@@ -77,7 +79,6 @@ export class LiveStage extends Stage {
     super(canvas);
     this.canvas = canvas;
     this.target = new Vec3();
-    canvas.addEventListener("keydown", (event) => this.#key(event));
     this.#follow(canvas);
     new ResizeObserver(() => this.#resize()).observe(canvas);
     this.#resize();
@@ -100,10 +101,6 @@ export class LiveStage extends Stage {
     this.#place(new Vec3(...numbers).scale(this.radius).add(this.centre).sub(this.target));
   }
 
-  reset() {
-    this.view = this.home;
-  }
-
   draw() {
     super.draw();
     const scale = this.canvas.parentElement.querySelector("[data-scale]");
@@ -123,8 +120,7 @@ export class LiveStage extends Stage {
 
   #resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
-    if (!width || !height) return;
-    this.size(width, height, Math.min(devicePixelRatio, 2));
+    if (width && height) this.size(width, height, Math.min(devicePixelRatio, 2));
     this.invalidate();
   }
 
@@ -154,10 +150,6 @@ export class LiveStage extends Stage {
     this.#place(offset);
   }
 
-  #zoom(factor) {
-    this.#place(this.offset.scale(factor));
-  }
-
   /** One finger or the left button turns; two fingers, the right button or a held key move; the wheel zooms. */
   #follow(canvas) {
     const held = new Map();
@@ -168,31 +160,28 @@ export class LiveStage extends Stage {
     canvas.addEventListener("pointermove", (event) => {
       const was = held.get(event.pointerId);
       if (!was) return;
-      const [right, down] = [event.clientX - was.clientX, event.clientY - was.clientY];
+      const [right, down] = [event.clientX - was.clientX, event.clientY - was.clientY], round = (-2 * Math.PI) / canvas.clientHeight;
       const other = [...held.values()].find((one) => one !== was), apart = (one) => Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY);
       held.set(event.pointerId, event);
       if (other) {
-        this.#zoom(apart(was) / Math.max(apart(event), 1));
+        this.#place(this.offset.scale(apart(was) / Math.max(apart(event), 1)));
         this.#pan(right / 2, down / 2);
       } else if (event.buttons === 1 && !event.shiftKey && !event.ctrlKey && !event.metaKey) {
-        this.#turn((-2 * Math.PI * right) / canvas.clientHeight, (-2 * Math.PI * down) / canvas.clientHeight);
+        this.#turn(round * right, round * down);
       } else {
         this.#pan(right, down);
       }
     });
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
-      this.#zoom(1.05 ** ((event.deltaY * (event.ctrlKey ? 10 : 1)) / 100)); // two fingers on a touchpad send the key
+      this.#place(this.offset.scale(1.05 ** ((event.deltaY * (event.ctrlKey ? 10 : 1)) / 100))); // touchpads send the key
     }, { passive: false });
-  }
-
-  #key(event) {
-    const turns = { ArrowLeft: [-TURN, 0], ArrowRight: [TURN, 0], ArrowUp: [0, -TURN], ArrowDown: [0, TURN] };
-    const zooms = { "+": 0.88, "=": 0.88, "-": 1.14 };
-    if (turns[event.key]) this.#turn(...turns[event.key]);
-    else if (zooms[event.key]) this.#zoom(zooms[event.key]);
-    else return;
-    event.preventDefault();
+    canvas.addEventListener("keydown", (event) => {
+      const turn = TURNS[event.key], zoom = ZOOMS[event.key];
+      if (turn) this.#turn(...turn);
+      if (zoom) this.#place(this.offset.scale(zoom));
+      if (turn || zoom) event.preventDefault();
+    });
   }
 }
 

@@ -8,7 +8,7 @@
   const readonly = button.disabled;
 
   function update() {
-    const why = form.querySelector("[data-blocks]")?.dataset.blocks ?? "";
+    const why = form.querySelector("[data-blocks]:not([data-blocks=''])")?.dataset.blocks ?? "";
     document.getElementById("blocked").textContent = why;
     button.disabled = readonly || why !== "";
   }
@@ -18,7 +18,6 @@
     const found = fields.querySelector("[data-found]");
     Object.assign(found, { textContent: text }).dataset.state = state;
     fields.dataset.blocks = blocks;
-    if (!blocks) delete fields.dataset.blocks;
     update();
   }
 
@@ -33,7 +32,7 @@
   for (const kind of ["htmx:response:error", "htmx:error"]) {
     form.addEventListener(kind, ({ target, detail: { ctx } }) => {
       const fields = target.closest("[data-thing] .fields"), status = ctx?.response?.status;
-      if (!fields || status === 422) return;
+      if (!fields) return;
       if (ctx) ctx.swap = "none";
       say(fields, `The upload failed${status ? ` (HTTP ${status})` : ""}`, "bad", "The file is not uploaded: choose it again, or select a known one.");
     });
