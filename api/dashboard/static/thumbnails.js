@@ -31,7 +31,7 @@ function picture(canvas, shown, side, room) {
 async function draw(canvas) {
   if (canvas.dataset.model) {
     const made = figureOf(ready(), await loadGlb(canvas.dataset.model));
-    return picture(canvas, [made.group], beforePalm(made), 0.9);
+    return picture(canvas, [made.group], beforePalm(made));
   }
   const [grasp, hand, thing] = await Promise.all([
     fetch(canvas.dataset.grasp).then((answer) => (answer.ok ? answer.json() : Promise.reject(new Error(answer.status)))),
