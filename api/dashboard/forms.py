@@ -126,7 +126,7 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
     things = {kind: choose_asset(request, assets, fields, kind) for kind in FILE_FIELDS}
     form |= {kind.value: one.name for kind, one in things.items()}
     shown = DEFAULTS | form | {"units": shown_unit(fields)}
-    refused = {one.form_field(kind): one.refused.problem for kind, one in things.items() if one.refused}
+    refused = {one.form_field(kind): one.problem for kind, one in things.items() if one.problem}
     if any(fields.get(f"{kind.value}_fix") for kind in FILE_FIELDS):
         # A chosen file or the button of a fix only shows its result; the submit button submits.
         return _render_form(request, assets, shown, things=things, errors=refused)
