@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from graspd.exchange.inputs import case_of_shard
+from graspd.exchange.lerobot import EpisodesPart
 from graspd.exchange.plan import ExportPart, ExportSummary, held_out_objects, plain_name
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
@@ -40,17 +41,18 @@ class TrainingExportOptions:
 def export_training(source: str, format_: str, wishes: TrainingExportOptions, folder: Path) -> ExportSummary:
     """Write the grasps of all shards of a folder or a dataset in a training format.
     Raises InputError: the share is invalid, no shard has suitable grasps, or the format refuses them."""
-    shards = open_source(source)
-    lots = list(export_parts(shards, format_, wishes))
-    out = split_objects(lots, wishes.held_out)
     from graspd.exchange import dexlearn, graspgen, huggingface, lerobot
 
+    shards = open_source(source)
+    if format_ == "lerobot":
+        episodes = lerobot.episode_parts(shards, wishes.obj, every=wishes.every)
+        return lerobot.write(episodes, folder, split_objects(episodes, wishes.held_out))
+    lots = list(export_parts(shards, format_, wishes))
+    out = split_objects(lots, wishes.held_out)
     if format_ == "graspgen":
         return graspgen.write(lots, folder, out)
     columns = COLUMNS if format_ == "dexlearn" else (*COLUMNS, "image/rgb")
     pictures = Pictures(shards, columns, grasp_quality=(), valid=not wishes.every, unvalidated=wishes.unvalidated)
-    if format_ == "lerobot":
-        return lerobot.write(lots, pictures, folder, out)
     writer = dexlearn.write if format_ == "dexlearn" else huggingface.write
     return writer(lots, pictures, folder, out, parse_depth_noise(wishes.noise or None))
 
@@ -137,7 +139,7 @@ def shape_signature(obj: ObjectModel) -> Floats:
     return np.asarray(np.quantile(distance, QUANTILES) / np.sqrt(np.mean(distance**2)))
 
 
-def split_objects(lots: Iterable[ExportPart], share: float) -> frozenset[str]:
+def split_objects(lots: Iterable[ExportPart | EpisodesPart], share: float) -> frozenset[str]:
     """Return the names of the held-out objects. Raises InputError: the share is not between 0 and 1."""
     if not 0 < share < 1:
         raise InputError(f"--held-out is {share:g}; give a share of the objects between 0 and 1")

@@ -13,6 +13,7 @@ import typer
 from graspd.service.cli import CommandGroup, JsonFlag, print_result, progress_bar, write_output
 from graspd.service.store.shards import read_shard, write_shard
 from graspd.worker.episodes.episode import EpisodeOutcome
+from graspd.worker.episodes.film import cameras_attribute, film_maker, film_options
 from graspd.worker.episodes.shard import EpisodeOptions, episodes_of_shard, record_episodes, replay_episodes
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.provenance import hand_of_shard, id_of_columns, object_of_shard, scenes_of_shard
@@ -38,6 +39,9 @@ def create(
     fps: Annotated[float, typer.Option(min=5, max=60, help="Rate of frames [Hz].")] = EpisodeOptions.fps,
     seed: Annotated[int, typer.Option(min=0, help="Seed of start postures and motions.")] = 0,
     limit: Annotated[int, typer.Option(min=0, help="Number of valid grasps, from the first; 0: all.")] = 0,
+    film: Annotated[str, typer.Option(help="Cameras that film episodes: scene,wrist,moving; default: none.")] = "",
+    size: Annotated[str, typer.Option(help="Width and height of films [px].")] = "320x240",
+    channels: Annotated[str, typer.Option(help="Further videos of each camera: depth,segmentation.")] = "",
     threads: ThreadsOption = 0,
     output: Annotated[Path, typer.Option("--output", "-o", help="HDF5 file to write.")] = Path("episodes.h5"),
     json: JsonFlag = False,
@@ -48,7 +52,11 @@ def create(
     model, thing = hand_of_shard(shard, hand), object_of_shard(shard, object)
     with progress_bar(quiet=json) as report:
         run = ExecutionContext(threads=threads, progress=report)
-        columns, attributes = record_episodes(shard, model, thing, scenes_of_shard(shard), options, run=run)
+        filmed = film_maker(shard, film_options(film, size, channels, fps), seed, run) if film else None
+        placed = scenes_of_shard(shard)
+        columns, attributes = record_episodes(shard, model, thing, placed, options, film=filmed, run=run)
+    if film:
+        attributes["cameras"] = cameras_attribute(film_options(film, size, channels, fps))
     attributes["shard_id"] = id_of_columns(columns)
     write_output(output, write_shard("episodes", columns, attributes))
     counts, frames = count_outcomes(columns["episode/outcome"]), columns["episode/frames"]

@@ -72,21 +72,28 @@ LIFT_OUTCOMES: Final = dict(enumerate((*_LIFT_OUTCOMES, "rotated", "diverged", "
 #: Meanings of `worker.episodes.episode.EpisodeOutcome`; grasps with the last four were not executed.
 _EPISODE_OUTCOMES = ("succeeded", "touched", "not lifted", "dropped", "diverged", "out of reach")
 EPISODE_OUTCOMES: Final = dict(enumerate((*_EPISODE_OUTCOMES, "no continuous motion", "collision", "no transit")))
+EXECUTED: Final = _EPISODE_OUTCOMES[:5]
 #: Meanings of the codes of phases, `worker.episodes.episode.PHASES`.
 _PHASES = ("transit", "approach", "shape", "close", "squeeze", "lift", "hold")
 EPISODE_PHASES: Final = dict(enumerate(_PHASES))
 #: Cameras that film episodes.
 CAMERAS: Final = ("scene", "wrist", "moving")
+#: Videos of each camera.
+VIDEOS: Final = {camera: (camera, f"{camera}_depth", f"{camera}_segmentation") for camera in CAMERAS}
 
 _BITS: Final = ", ".join(f"{1 << bit} {name}" for bit, name in enumerate(ENGINES))
 
 
-def _video_columns(camera: str) -> dict[str, Column]:
-    about = f"the {camera} camera's videos, one per episode; codec in attribute cameras"
-    return {
-        f"video/{camera}": _optional_column("*", "u1", "bytes", "none", f"{about}: all files in sequence"),
-        f"video/{camera}_bytes": _optional_column("E", "i8", "bytes", "none", f"{about}: size of each file"),
+def _camera_columns(camera: str) -> dict[str, Column]:
+    columns = {
+        f"camera/{camera}_pose": _optional_column("F 7", "f4", "m, 1", "scene", "camera: x right, y down, z forward")
     }
+    for name, about in zip(
+        VIDEOS[camera], ("AV1 in MP4", "16-bit FFV1, depth [mm]", "8-bit FFV1, labels"), strict=True
+    ):
+        columns[f"video/{name}"] = _optional_column("*", "u1", "bytes", "none", f"videos in sequence: {about}")
+        columns[f"video/{name}_bytes"] = _optional_column("E", "i8", "bytes", "none", "size of each video")
+    return columns
 
 
 def _wrist_column(rows: str) -> Column:
@@ -204,7 +211,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             for one in GRASP_METRICS
             if one.optional and not one.swept
         },
-        **{path: column for camera in CAMERAS for path, column in _video_columns(camera).items()},
+        **{path: column for camera in CAMERAS for path, column in _camera_columns(camera).items()},
     },
 }
 
@@ -278,7 +285,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "arm_mount": RootAttribute("text", "link of the arm that carries the hand", _EPISODES),
     "arm_mount_pose": RootAttribute("text", "pose of the hand's root link in the frame of this link", _EPISODES),
     "arm_base": RootAttribute("text", "pose of the arm's root link in the scene", _EPISODES),
-    "cameras": RootAttribute("text", "JSON: width, height, codec and poses of each camera; absent: none", _EPISODES),
+    "cameras": RootAttribute("text", "JSON: size, intrinsics and codec of each camera; absent: none", _EPISODES),
 }
 
 

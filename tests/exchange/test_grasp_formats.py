@@ -266,7 +266,7 @@ def test_a_shard_with_the_joints_of_another_hand_is_refused(stored: Shard, tmp_p
 
 #: What an export begins with.
 BEGUN = {"dexlearn": "assets/object/graspd", "graspgen": "grasps", "huggingface": "grasps"}
-BEGUN |= {"lerobot": "meta", "webdataset": "pictures-000000.tar"}
+BEGUN |= {"webdataset": "pictures-000000.tar"}
 
 
 @pytest.mark.parametrize("format_", BEGUN)

@@ -72,4 +72,6 @@ class Episode:
     action: Floats  # (T, D) commanded from this frame to the next
     object_pose: Floats = field(default_factory=lambda: np.zeros((0, 7)))  # (T, 7) in the scene
     neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))  # (T, M, 7) in the scene
-    videos: Mapping[str, bytes] = field(default_factory=dict)  # file of each camera
+    videos: Mapping[str, bytes] = field(default_factory=dict)  # video of each of `columns.VIDEOS`
+    camera_pose: Mapping[str, Floats] = field(default_factory=dict)
+    """(T, 7) pose of each camera in the scene: x right, y down, z forward."""

@@ -1,6 +1,6 @@
 """Episodes of a base shard's grasps, and the HDF5 shard of episodes."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import ConflictError, InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats
-from graspd.service.store.columns import CAMERAS, SCHEMAS, Attribute
+from graspd.service.store import validity
+from graspd.service.store.columns import CAMERAS, SCHEMAS, VIDEOS, Attribute
 from graspd.service.store.shards import Shard
 from graspd.worker.episodes.episode import Episode, EpisodeOutcome, Robot
 from graspd.worker.episodes.execution import Executions, ToolFrame, build_executions
@@ -37,8 +38,8 @@ _INHERITED: Final = (
 )
 _FRAMES: Final = ("state", "action", "phase", "object_pose", "neighbour_pose")
 
-#: Returns the file of each camera that films an episode, by its name in `CAMERAS`.
-Film = Callable[[Episode], Mapping[str, bytes]]
+#: Adds videos and camera poses to an episode.
+Film = Callable[[Episode], Episode]
 #: Makes the film of one thread, for a robot and its grasps.
 FilmMaker = Callable[[Robot, Executions], Film]
 
@@ -54,6 +55,7 @@ class EpisodeOptions:
     fps: float = FPS
     seed: int = 0
     limit: int = 0  # number of valid grasps, from the first; 0: all
+    empty: bool = False  # whether a shard without valid grasps has an empty result
 
 
 def record_episodes(
@@ -75,11 +77,14 @@ def record_episodes(
         raise InputError(
             f"{base.path or 'the shard'} has free grasps; episodes need a scene: graspd synth --scene table"
         )
-    rows = np.flatnonzero(select_grasps(base)[0])[: options.limit or None]
+    valid = validity.valid_mask(base.arrays) if options.empty else select_grasps(base)[0]
+    rows = np.flatnonzero(valid)[: options.limit or None]
     robot = read_robot(hand, options.arm, mount=options.mount, mount_pose=options.mount_pose, base=options.base)
     grasps, tool = GraspSet.from_columns(base.arrays).take(rows), ToolFrame(hand.root_link, IDENTITY_POSE)
     found = build_executions(hand, obj, grasps, rows=rows, placed=placed.take(rows), tool=tool, quality={})
     convex, done = pieces or decompose(obj), Count(len(found), run, "episodes")
+    state, beside = np.zeros((0, len(robot.names))), np.zeros((0, len(placed.neighbours), 7))
+    none = Episode(0, 0, EpisodeOutcome.NO_TRANSIT, np.zeros(0, np.uint8), state, state, neighbour_pose=beside)
 
     def make() -> tuple[MotionPlanner, Simulation, Film | None]:
         planner = MotionPlanner(robot, found, convex, seed=options.seed)
@@ -91,11 +96,9 @@ def record_episodes(
         motion, shard_row = planner.plan(row), int(rows[row])
         if isinstance(motion, Motion):
             episode = simulation.execute(motion, shard_row)
-            episode = replace(episode, videos=camera(episode)) if camera else episode
+            episode = episode if camera is None else camera(episode)
         else:
-            none, beside = np.zeros((0, len(robot.names))), np.zeros((0, len(placed.neighbours), 7))
-            scene, phase = int(placed.index[shard_row]), np.zeros(0, np.uint8)
-            episode = Episode(shard_row, scene, motion, phase, none, none, neighbour_pose=beside)
+            episode = replace(none, row=shard_row, scene=int(placed.index[shard_row]), outcome=motion)
         done.add(1)
         return episode
 
@@ -104,7 +107,7 @@ def record_episodes(
     attributes: dict[str, Attribute] = inherited | source_attributes(base) | _robot_attributes(robot, options)
     attributes |= {"seed": options.seed, "fps": options.fps, "device": "cpu"}
     quality = [path for path in SCHEMAS["episodes"] if path.startswith("quality/") and path in base.arrays]
-    columns = episode_columns(episodes, placed) | {path: np.asarray(base.arrays[path])[rows] for path in quality}
+    columns = episode_columns(episodes, none, placed) | {path: np.asarray(base.arrays[path])[rows] for path in quality}
     return columns, attributes | {"seconds": round(perf_counter() - began, 4)}
 
 
@@ -143,8 +146,8 @@ def robot_of_shard(shard: Shard, hand: HandModel) -> Robot:
     return robot
 
 
-def episode_columns(episodes: list[Episode], placed: PlacedGrasps) -> dict[str, NDArray[Any]]:
-    """Return the columns of a shard of episodes, except those of the grasps' quality."""
+def episode_columns(episodes: list[Episode], none: Episode, placed: PlacedGrasps) -> dict[str, NDArray[Any]]:
+    """Return the columns of a shard of episodes, except those of the grasps' quality; `none` has no frames."""
     columns: dict[str, NDArray[Any]] = {
         "episode/row": np.array([one.row for one in episodes], np.int32),
         "episode/scene_index": np.array([one.scene for one in episodes], np.int32),
@@ -153,14 +156,18 @@ def episode_columns(episodes: list[Episode], placed: PlacedGrasps) -> dict[str, 
         "scene/object_pose": np.asarray(placed.object_pose),
     }
     for name in _FRAMES if placed.neighbours else _FRAMES[:-1]:
-        columns[f"frame/{name}"] = np.concatenate([getattr(one, name) for one in episodes])
+        parts, dtype = [getattr(one, name) for one in (none, *episodes)], SCHEMAS["episodes"][f"frame/{name}"].dtype
+        columns[f"frame/{name}"] = np.concatenate(parts, dtype=dtype, casting="same_kind")
     if placed.neighbours:
         columns["scene/neighbour_pose"] = np.asarray(placed.neighbour_pose)
     for camera in CAMERAS:
-        files = [one.videos.get(camera, b"") for one in episodes]
-        if any(files):
-            columns[f"video/{camera}"] = np.frombuffer(b"".join(files), np.uint8)
-            columns[f"video/{camera}_bytes"] = np.array([len(file) for file in files], np.int64)
+        if poses := [one.camera_pose[camera] for one in episodes if camera in one.camera_pose]:
+            columns[f"camera/{camera}_pose"] = np.concatenate(poses)
+        for name in VIDEOS[camera]:
+            files = [one.videos.get(name, b"") for one in episodes]
+            if any(files):
+                columns[f"video/{name}"] = np.frombuffer(b"".join(files), np.uint8)
+                columns[f"video/{name}_bytes"] = np.array([len(file) for file in files], np.int64)
     return columns
 
 
@@ -171,22 +178,29 @@ def episodes_of_shard(shard: Shard) -> list[Episode]:
     for name in _FRAMES:
         if (column := shard.arrays.get(f"frame/{name}")) is not None:
             parts[name] = np.split(column if name == "phase" else np.asarray(column, float), ends)
-    videos = {camera: _files(shard, camera) for camera in CAMERAS if f"video/{camera}" in shard.arrays}
+    videos = {
+        name: _files(shard, name) for names in VIDEOS.values() for name in names if f"video/{name}" in shard.arrays
+    }
+    paths = {camera: f"camera/{camera}_pose" for camera in CAMERAS}
+    cameras = {
+        camera: np.split(np.asarray(shard[path], float), ends) for camera, path in paths.items() if path in shard.arrays
+    }
     return [
         Episode(
             row=int(shard["episode/row"][number]),
             scene=int(shard["episode/scene_index"][number]),
             outcome=EpisodeOutcome(int(shard["episode/outcome"][number])),
-            videos={camera: files[number] for camera, files in videos.items()},
+            videos={name: files[number] for name, files in videos.items()},
+            camera_pose={camera: poses[number] for camera, poses in cameras.items()},
             **{name: part[number] for name, part in parts.items()},
         )
         for number in range(len(counts))
     ]
 
 
-def _files(shard: Shard, camera: str) -> list[bytes]:
-    ends = np.cumsum(shard[f"video/{camera}_bytes"])
-    return [part.tobytes() for part in np.split(shard[f"video/{camera}"], ends[:-1])]
+def _files(shard: Shard, video: str) -> list[bytes]:
+    ends = np.cumsum(shard[f"video/{video}_bytes"])
+    return [part.tobytes() for part in np.split(shard[f"video/{video}"], ends[:-1])]
 
 
 def _robot_attributes(robot: Robot, options: EpisodeOptions) -> dict[str, Attribute]:

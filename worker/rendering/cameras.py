@@ -5,6 +5,7 @@ Camera frame: x right, y down, z forward (OpenCV). Extrinsics E = [R | t] map ta
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
@@ -76,11 +77,11 @@ def inscribed_field_of_view(k: Floats, width: int, height: int) -> float:
     return float(2 * np.arctan(min(slopes)))
 
 
-def look_at(eye: Floats, target: Floats) -> Floats:
-    """Return extrinsics (4, 4) of a camera at `eye` that looks at `target`, the table's z axis up."""
+def look_at(eye: Floats, target: Floats, up: Sequence[float] | Floats = (0.0, 0.0, 1.0)) -> Floats:
+    """Return extrinsics (4, 4) of a camera at `eye` that looks at `target`, by default the table's z axis up."""
     forward = np.asarray(target, float) - eye
     forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = np.cross(forward, up)
     if np.linalg.norm(right) < 1e-9:
         right = np.array([1.0, 0.0, 0.0])
     right /= np.linalg.norm(right)

@@ -70,7 +70,7 @@ class Tracer:
         placed["place"], placed["turn"] = poses[..., :3], np.swapaxes(quat_to_matrix(poses[..., 3:]), -1, -2)
         placed["lower"], placed["upper"] = corners.min(axis=2) - _SLACK_M, corners.max(axis=2) + _SLACK_M
         self._placed: Any = wp.array(placed, dtype=_PLACED, device=self.device)
-        every = _struct_array([look for world in looks for look in world], Material, self.device)
+        every = struct_array([look for world in looks for look in world], Material, self.device)
         self._materials: Any = every.reshape(poses.shape[:2])
 
     def render(self, shot: CameraShot, run: ExecutionContext = DEFAULT_CONTEXT) -> Pictures:
@@ -97,7 +97,7 @@ class _ShotRenderer:
     def __init__(self, tracer: Tracer, shot: CameraShot) -> None:
         self._tracer, self._shot, device = tracer, shot, tracer.device
         passes = light_passes(shot.samples, shot.toward_lamp)
-        self._passes = _struct_array(passes, exposure.LightPass, device)
+        self._passes = struct_array(passes, exposure.LightPass, device)
         # Worlds turn under the lamp, so in their frames lamp and sky turn in the opposite direction.
         back = transforms.quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), -np.asarray(shot.turn))
         toward = quat_rotate(back[:, None], np.array([one.toward for one in passes]))
@@ -118,7 +118,7 @@ class _ShotRenderer:
             tracer._materials,
             wp.array(world, dtype=wp.int32, device=device),
             wp.array(self._cameras[views], dtype=wp.transformf, device=device),
-            _struct_array([shot.lamps[w] for w in world], Light, device),
+            struct_array([shot.lamps[w] for w in world], Light, device),
             wp.vec2f(k[0, 0], k[1, 1]),
             wp.vec2f(k[0, 2], k[1, 2]),
             self._passes,
@@ -136,7 +136,7 @@ class _ShotRenderer:
         return tuple(array.numpy() for array in outputs)
 
 
-def _struct_array(things: Sequence[Any], struct: Any, device: str) -> Any:
+def struct_array(things: Sequence[Any], struct: Any, device: str) -> Any:
     """Return an array of Warp structs, filled from attributes of equal names."""
     kind = np.dtype(struct.numpy_dtype())
     rows = [tuple(getattr(thing, name) for name in kind.names or ()) for thing in things]

@@ -87,8 +87,8 @@ def test_films_are_stored_by_camera_and_episode(table: Path) -> None:
     shard = read_shard(table, kind="base")
     hand, obj, placed = hand_of_shard(shard, None), object_of_shard(shard, None), scenes_of_shard(shard)
 
-    def film(episode: Episode) -> dict[str, bytes]:
-        return {"wrist": bytes([episode.row]) * (episode.row + 1)}
+    def film(episode: Episode) -> Episode:
+        return replace(episode, videos={"wrist": bytes([episode.row]) * (episode.row + 1)})
 
     columns, attributes = record_episodes(
         shard, hand, obj, placed, EpisodeOptions(), film=lambda robot, found: film, run=ExecutionContext(threads=2)
