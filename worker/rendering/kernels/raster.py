@@ -101,7 +101,16 @@ def cover(
     corner = wp.vec3f(n0[2], n1[2], n2[2]) * side + 0.5 * (across + down)
     for row in range(top, bottom + 1):
         start = corner + wp.float32(row) * down
-        for column in range(left, right + 1):
+        first = left
+        last = right
+        if right - left > 8:
+            # Samples outside of an edge are skipped, except one on each side because of rounding.
+            for i in range(3):
+                if across[i] > 0.0:
+                    first = wp.max(first, wp.int32(wp.clamp(-start[i] / across[i], 0.0, 1.0e5)) - 1)
+                elif across[i] < 0.0:
+                    last = wp.min(last, wp.int32(wp.clamp(-start[i] / across[i], -2.0, 1.0e5)) + 1)
+        for column in range(first, last + 1):
             e = start + wp.float32(column) * across
             if e[0] >= 0.0 and e[1] >= 0.0 and e[2] >= 0.0:
                 z = wp.dot(e, depth) / (e[0] + e[1] + e[2])
