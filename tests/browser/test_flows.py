@@ -47,9 +47,8 @@ def test_a_user_goes_from_a_submission_to_a_retry(real_page: Any, tmp_path: Path
     page.wait_for_selector("[data-thing=object] figure[data-state=ready]")
     page.fill("#grasps", "8")
     page.click("summary:has-text('Advanced')")
-    with page.expect_response("**/submit?*"):
-        page.select_option("#fidelity", "draft")
-    assert "8 valid grasps" in page.inner_text("#estimate")
+    page.select_option("#fidelity", "draft")
+    page.wait_for_selector("#estimate:has-text('8 valid grasps')")
     page.click("#snippets summary")
     until(lambda: "--fidelity draft" in page.inner_text("#snippet-shell"), "the command follows the form")
     page.click("text=Submit the job")
