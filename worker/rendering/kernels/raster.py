@@ -1,7 +1,8 @@
 """Warp kernels that rasterise triangles, with a shadow map per direction of light.
 
-Pictures have 2 x 2 samples per pixel. A film has so many pixels that rays cost too much. Triangles are tested with homogeneous edge functions (Olano and Greer
-1997), so none is clipped. A sample's key has its depth in the upper 32 bits and its face in the lower ones."""
+Pictures have 2 x 2 samples per pixel. A film has so many pixels that rays cost too much. Triangles are tested with
+homogeneous edge functions (Olano and Greer 1997), so none is clipped. A sample's key has its depth in the upper 32 bits
+and its face in the lower ones."""
 
 import warp as wp
 
