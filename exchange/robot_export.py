@@ -85,9 +85,8 @@ def _plan_for_arm(
     written: ExportSummary,
 ) -> Bundle:
     # Poses of an arm from a file have no default but the identity.
-    poses = {} if wishes.arm in BUILTIN_ARMS else dict.fromkeys(("mount_pose", "base"), "0 0 0 1 0 0 0")
-    stated = {"mount_pose": wishes.mount_pose, "base": wishes.base}
-    poses |= {name: pose for name, pose in stated.items() if pose is not None}
+    pose = None if wishes.arm in BUILTIN_ARMS else "0 0 0 1 0 0 0"
+    poses = {"mount_pose": wishes.mount_pose or pose, "base": wishes.base or pose}
     robot = read_robot(found.hand, wishes.arm, mount=wishes.mount, **poses)
     arm, base = robot.arm, robot.base
     assert arm is not None

@@ -21,18 +21,22 @@ CONTROL_STEP_S: Final = 0.02
 #: Duration of each phase where limits allow [s].
 NOMINAL_S: Final = dict(zip(PHASES, (1.0, 0.7, 0.3, 0.4, 0.3, 0.8, 0.5), strict=True))
 #: Home of a flying hand: its palm here in the scene, facing down, and half the range of seeded changes [m], [rad].
-FLYING_HOME_M: Final = (-0.25, 0.0, 0.35)
+FLYING_HOME_M: Final = (-0.4, 0.0, 0.3)
 FLYING_CHANGE_M: Final = 0.05
 FLYING_CHANGE_RAD: Final = 0.5
-#: Heights above the standoff of points by which a flying hand avoids obstacles [m].
+#: Heights above home and standoff at which a flying hand passes obstacles [m].
 DETOURS_M: Final = (0.1, 0.2, 0.3)
-#: Numbers of tested postures of a transit, and of control points of one with corners, tried in turn.
-CHECKS: Final = 60
+#: Clearance of a transit [m]; less if the standoff has less.
+CLEARANCES_M: Final = (0.01, 0.002, 0.0)
+#: Time between tested postures of a transit that is as fast as limits allow [s].
+CHECK_S: Final = 0.01
+#: Numbers of control points of a transit with corners, tried in turn.
 CONTROLS: Final = (12, 24, 48)
 #: Margin of sampled postures around both ends of an arm's transit [rad or m].
 WIDER: Final = 1.5
 #: Number of an arm's motions to the grasp from which a transit is tried.
 MOST_TRANSITS: Final = 3
+_NO_TRANSIT: Final = EpisodeOutcome.NO_TRANSIT
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,7 @@ class MotionPlanner:
         self.robot, self.found, self.seed, self.step = robot, found, seed, step
         self.limits = MotionLimits.of_robot(robot)
         self._split = len(robot.names) - robot.hand.dofs  # number of the arm's dofs, or of the root pose's values
+        self._clearance = CLEARANCES_M[0]
         if robot.arm is None:
             self._world = ArmScene(None, robot.base, robot.hand, pieces, found.placed)
         else:
@@ -68,17 +73,16 @@ class MotionPlanner:
 
     def _plan_flight(self, row: int, rng: np.random.Generator) -> Motion | EpisodeOutcome:
         hand = self.robot.hand
-        paths = [
-            np.concatenate([path.hand_pose, hand.reduce(path.joints)], axis=1)
-            for path in straight_paths(self.found, row)
-        ]
+        paths = [np.hstack([path.hand_pose, hand.reduce(path.joints)]) for path in straight_paths(self.found, row)]
         end = paths[0][0]
         home = np.concatenate([flying_home(hand, rng), end[7:]])
-        detours = (np.stack([home, end + height * np.eye(len(end))[2], end]) for height in DETOURS_M)
-        for corners in (np.stack([home, end]), *detours):
+        self._choose_clearance(end, row)
+        for height in (0.0, *DETOURS_M):
+            corners = np.stack([home, home, end, end] if height else [home, end])
+            corners[1:-1, 2] = max(home[2], end[2]) + height
             if (transit := self._free_path(corners, row)) is not None:
                 return self._timed([transit, *paths])
-        return EpisodeOutcome.NO_TRANSIT
+        return _NO_TRANSIT
 
     def _plan_arm(self, row: int, rng: np.random.Generator) -> Motion | EpisodeOutcome:
         reason, tried = "", 0
@@ -92,51 +96,52 @@ class MotionPlanner:
             tried += 1
             if tried == MOST_TRANSITS:
                 break
-        return (
-            EpisodeOutcome.NO_TRANSIT if tried else EpisodeOutcome(EpisodeOutcome.OUT_OF_REACH + reason_stage(reason))
-        )
+        return _NO_TRANSIT if tried else EpisodeOutcome(EpisodeOutcome.OUT_OF_REACH + reason_stage(reason))
 
     def _states(self, path: Path) -> Floats:
         assert self.robot.arm is not None
         tree = self.robot.arm.model
         of_arm, of_hand = np.split(path.joints, [len(tree.joint_names)], axis=1)
-        return np.concatenate([tree.reduce(of_arm), self.robot.hand.reduce(of_hand)], axis=1)
+        return np.hstack([tree.reduce(of_arm), self.robot.hand.reduce(of_hand)])
 
     def _arm_transit(self, end: Floats, row: int, rng: np.random.Generator) -> Floats | None:
         """Return a free path (M, D) of an arm from its home posture, with the hand as at the end, or None."""
         assert self.robot.arm is not None
         tree, home, held = self.robot.arm.model, self.robot.arm.home, end[self._split :]
         corners = np.stack([np.concatenate([home, held]), end])
+        self._choose_clearance(end, row)
         if (path := self._free_path(corners, row)) is not None:
             return path
         goal = end[: self._split]
-        low, high = (
-            np.maximum(np.minimum(home, goal) - WIDER, tree.lower),
-            np.minimum(np.maximum(home, goal) + WIDER, tree.upper),
-        )
+        ends = np.stack([np.minimum(home, goal) - WIDER, np.maximum(home, goal) + WIDER])
+        low, high = np.clip(ends, tree.lower, tree.upper)
         free = connect(home, goal, low, high, lambda q: self._is_free(np.concatenate([q, held]), row), rng)
         if free is None:
             return None
-        return self._free_path(np.concatenate([free, np.tile(held, (len(free), 1))], axis=1), row)
+        return self._free_path(np.hstack([free, np.tile(held, (len(free), 1))]), row)
 
     def _free_path(self, corners: Floats, row: int) -> Floats | None:
         """Return a path (M, D) near lines between corners (C, D) whose curve is free, or None."""
         for points in CONTROLS if len(corners) > 2 else (4,):
             path = self.limits.resampled(corners, points)
-            # The end is the most likely posture to collide.
-            if all(self._is_free(state, row) for state in self.limits.curve(path, np.linspace(1, 0, CHECKS))):
+            if all(self._is_free(state, row) for state in self.limits.timed(path, 0.0, CHECK_S)):
                 return path
         return None
 
     def _is_free(self, state: Floats, row: int) -> bool:
         joints = self.robot.hand.expand(state[self._split :])
-        return not self._world.first_collision(state[: self._split], joints, self.found.object_pose[row], whole=True)
+        world, rest = self._world, self.found.object_pose[row]
+        return not world.first_collision(state[: self._split], joints, rest, clearance=self._clearance)
+
+    def _choose_clearance(self, end: Floats, row: int) -> None:
+        """Choose the largest clearance that the end of a transit has."""
+        for self._clearance in CLEARANCES_M:
+            if self._is_free(end, row):
+                break
 
     def _timed(self, paths: list[Floats]) -> Motion:
         """Return the sequence of timed paths (M, D), all from rest to rest, and the hold."""
-        parts = [
-            self.limits.timed(path, NOMINAL_S[phase], self.step) for phase, path in zip(PHASES, paths, strict=False)
-        ]
+        parts = [self.limits.timed(path, NOMINAL_S[PHASES[k]], self.step) for k, path in enumerate(paths)]
         parts.append(np.repeat(paths[-1][-1:], round(NOMINAL_S["hold"] / self.step), axis=0))
         phase = np.repeat(np.arange(len(parts), dtype=np.uint8), [len(part) for part in parts])
         targets = self.limits.continuous(np.concatenate([paths[0][:1], *parts]))

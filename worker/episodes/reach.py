@@ -42,39 +42,23 @@ class Arm:
     mount_pose: Floats  # (7,) pose of the mount link in its body's frame
     hand_pose: Floats  # (7,) pose of the hand's root link in the mount link's frame
     home: Floats  # (A,) dofs at the start of an episode, and first start of inverse kinematics
-    acceleration: Floats  # (A,) limits [rad/s^2 or m/s^2]
 
     def root_pose(self, body_pose: Floats) -> Floats:
         """Return poses (..., 7) of the hand's root link for poses of the body that carries the mount."""
         return compose(compose(body_pose, self.mount_pose), self.hand_pose)
 
 
-#: Acceleration limit of a joint without a published one [rad/s^2], [m/s^2].
-ASSUMED_RAD_S2: Final = 10.0
-ASSUMED_M_S2: Final = 2.0
-
-
-@dataclass(frozen=True)
-class BuiltinArm:
-    """What the description of a built-in arm, `service/builtin/arms`, does not state; its mount is `flange`."""
-
-    home: tuple[float, ...]  # the flange ahead of the base, pointing down [rad]
-    acceleration: tuple[float, ...] | None  # [rad/s^2]; None if the manufacturer publishes none
-
-
+#: Home of each built-in arm, `service/builtin/arms`: the flange ahead of the base, pointing down [rad].
 BUILTIN_ARMS: Final = {
-    "franka": BuiltinArm(
-        (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4),
-        (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0),
-    ),
-    "ur10e": BuiltinArm((math.pi, -2.2, 2.0, 0.2 - math.pi / 2, -math.pi / 2, 0.0), None),
+    "franka": (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4),
+    "ur10e": (math.pi, -2.2, 2.0, 0.2 - math.pi / 2, -math.pi / 2, 0.0),
 }
 
 
 def read_arm(path: str | pathlib.Path, mount: str | None, hand_pose: Floats) -> Arm:
     """Read a built-in arm, or one from a URDF, its folder or a ZIP, without links below the mount, such as a gripper.
-    Joints that do not lead to the mount are fixed at zero, or at the nearest value inside their limits. Raises
-    InputError: there is no such arm, no link `mount`, or no joint moves it; an arm from a file has no default mount."""
+    Joints that do not lead to the mount are fixed at zero, or at the nearest value inside their limits. A built-in arm
+    has the mount `flange`. Raises InputError: there is no such arm, no link `mount`, or no joint moves it."""
     builtin = BUILTIN_ARMS.get(str(path))
     if builtin is not None:
         mount = mount or "flange"
@@ -109,18 +93,8 @@ def read_arm(path: str | pathlib.Path, mount: str | None, hand_pose: Floats) -> 
     model = body_model(replace(source, options=chosen), tree)
     model = replace(model, neighbours=collision_exempt_pairs(model))
     body, pose = tree.links[mount]
-    lead = model.joint_type[model.joint_body[model.first_joint]]
-    assumed = np.where(lead == JointType.REVOLUTE, ASSUMED_RAD_S2, ASSUMED_M_S2)
-    stated_home = None if builtin is None else np.array(builtin.home)
-    return Arm(
-        model,
-        mount,
-        body,
-        np.asarray(pose, float),
-        hand_pose,
-        0.5 * (model.lower + model.upper) if stated_home is None else stated_home,
-        assumed if builtin is None or builtin.acceleration is None else np.array(builtin.acceleration),
-    )
+    home = 0.5 * (model.lower + model.upper) if builtin is None else np.array(builtin)
+    return Arm(model, mount, body, np.asarray(pose, float), hand_pose, home)
 
 
 @dataclass(frozen=True)
@@ -159,6 +133,7 @@ REASONS: Final = ("out of reach", "no continuous motion", "collision")
 #: Damping of inverse kinematics, of squared errors [m^2], and largest step of a dof [rad or m].
 DAMPING: Final = 0.1
 LARGEST_STEP: Final = 0.5
+_WEIGHTS: Final = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])  # of errors [m] and [rad]
 
 
 def reason_stage(reason: str) -> int:
@@ -175,7 +150,10 @@ class ReachResult:
     """Their motions; joints are the arm's, then the hand's."""
     refused: Counter[str] = field(default_factory=Counter)
     """Number of grasps that the arm cannot execute, by reason."""
-    candidates: int = 0
+
+    @property
+    def candidates(self) -> int:
+        return len(self.rows) + self.refused.total()
 
 
 class ReachSearch:
@@ -197,7 +175,6 @@ class ReachSearch:
         """Search motions for all grasps in their order, or until `wanted` (if above 0) are executable."""
         reached = ReachResult()
         for row in range(len(self.found)):
-            reached.candidates += 1
             paths, reason = self.search_row(row)
             if paths is None:
                 reached.refused[reason] += 1
@@ -286,19 +263,12 @@ class ReachSearch:
 
     def _step(self, q: Floats, jacobian: Floats, error: Floats) -> Floats:
         """Return the damped least-squares step (A,) of dofs; dofs that it would press against a limit stay."""
-        arm, free = self.arm.model, np.ones(len(q))
-        weights = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])
-        wanted = weights * error
+        J, wanted = _WEIGHTS[:, None] * jacobian, _WEIGHTS * error
+        pull = J.T @ wanted
+        J = J * ~((q <= self.arm.model.lower) & (pull < 0) | (q >= self.arm.model.upper) & (pull > 0))
         damping = DAMPING * (1e-3 + min(float(wanted @ wanted), 1.0))
-        step = free
-        for _ in range(2):
-            J = weights[:, None] * jacobian * free
-            step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), wanted)
-            pressed = ((q <= arm.lower) & (step < 0)) | ((q >= arm.upper) & (step > 0))
-            if not pressed.any():
-                break
-            free = np.where(pressed, 0.0, free)
-        return step * free * min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-9))
+        step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), wanted)
+        return np.asarray(step * min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-9)))
 
     def _collision(self, joined: list[Floats], ways: list[Path], row: int) -> str:
         """Return the first pair of the arm and another body that collides on the trajectory; else an empty text."""
@@ -369,11 +339,10 @@ class ArmScene:
         self.hand_qpos = _joint_addresses(self.model, hand, "hand")
         self._object = int(self.model.body("object").mocapid[0])
         names = [self.model.body(b).name for b in range(self.model.nbody)]
-        hands = np.array([name.startswith("hand") for name in names])
-        self._hand_bodies, self._hand_geoms = hands, hands[self.model.geom_bodyid]
-        around = np.array([name in ("object", "world") or name.startswith("neighbour") for name in names])
-        self.model.geom_conaffinity[around[self.model.geom_bodyid]] |= _WHOLE
-        self.model.body_conaffinity[around] |= _WHOLE
+        self._hand = np.array([name.startswith("hand") for name in names])
+        self._around = np.array([name in ("object", "world") or name.startswith("neighbour") for name in names])
+        self.model.geom_conaffinity[self._around[self.model.geom_bodyid]] |= _WHOLE
+        self.model.body_conaffinity[self._around] |= _WHOLE
 
     def place_neighbours(self, row: int) -> None:
         """Place the neighbours of a grasp's scene, before collisions of that grasp are tested."""
@@ -382,17 +351,23 @@ class ArmScene:
             first = self._object + 1
             self.data.mocap_pos[first:], self.data.mocap_quat[first:] = poses[:, :3], poses[:, 3:]
 
-    def first_collision(self, carrier: Floats, hand_joints: Floats, object_pose: Floats, *, whole: bool = False) -> str:
+    def first_collision(
+        self, carrier: Floats, hand_joints: Floats, object_pose: Floats, *, clearance: float | None = None
+    ) -> str:
         """Return a colliding pair, or an empty text if there is none.
-        The posture is given by arm dofs (A,) or root pose (7,), hand joints (J,) and object pose (7,). Contacts of the
-        hand with its surroundings count if `whole`; contacts of the arm always count."""
-        self.model.geom_contype[self._hand_geoms] = self.model.body_contype[self._hand_bodies] = _WHOLE * whole
+        The posture is given by arm dofs (A,) or root pose (7,), hand joints (J,) and object pose (7,). With a
+        `clearance` [m], hand and arm must have it from their surroundings; else only contacts of the arm count."""
+        hand, around, margin = self._hand, self._around, clearance or 0.0
+        self.model.geom_contype[hand[self.model.geom_bodyid]] = self.model.body_contype[hand] = _WHOLE * (
+            clearance is not None
+        )
+        self.model.geom_margin[around[self.model.geom_bodyid]] = self.model.body_margin[around] = margin
         self._put(self.model, self.data, carrier, hand_joints)
         self.data.mocap_pos[self._object], self.data.mocap_quat[self._object] = object_pose[:3], object_pose[3:]
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_collision(self.model, self.data)
         for contact in self.data.contact:
-            if contact.dist < 0:
+            if contact.dist < margin:
                 return " and ".join(self._geom_label(int(geom)) for geom in contact.geom)
         return ""
 

@@ -14,7 +14,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 
 #: Distance of an arm's base from the scene's origin [m].
-BEHIND_M: Final = 0.6
+BEHIND_M: Final = 0.5
 #: Thickness of the adapter between flange and hand [m].
 ADAPTER_M: Final = 0.01
 
@@ -48,7 +48,8 @@ def adapter_pose(hand: HandModel) -> Floats:
     z is the palm's approach direction; with a forearm, z is the direction from its far end to the palm. The rear of the
     palm or forearm is `ADAPTER_M` before the flange, centred."""
     if hand.mounting is None:
-        out, corners = hand.palm.approach, np.concatenate([p.vertices for p in hand.pieces if p.body == 0])
+        palm = [p.vertices for p in hand.pieces if p.body == 0] or [hand.palm.centre[None]]
+        out, corners = hand.palm.approach, np.concatenate(palm)
     else:
         poses = _rest_poses(hand.mounting)
         corners = np.concatenate([apply(poses[p.body], p.vertices) for p in hand.mounting.pieces])
@@ -61,32 +62,24 @@ def adapter_pose(hand: HandModel) -> Floats:
 
 def rotation_between(a: Floats, b: Floats) -> Floats:
     """Return the quaternion (4,) of the smallest rotation from unit vector `a` (3,) to `b` (3,)."""
-    across = np.cross(a, b)
-    if (length := float(np.linalg.norm(across))) < 1e-9:
-        across, length = np.eye(3)[np.argmin(np.abs(a))], 1.0
-        across = np.cross(a, across) / np.linalg.norm(np.cross(a, across))
-        return quat_from_axis_angle(across, np.array(0.0 if a @ b > 0 else np.pi))
-    return quat_from_axis_angle(across / length, np.arctan2(length, a @ b))
+    half = np.array([1.0 + a @ b, *np.cross(a, b)])
+    if half[0] < 1e-9:
+        half = np.array([0.0, *np.cross(a, np.eye(3)[np.argmin(np.abs(a))])])
+    return half / np.linalg.norm(half)
 
 
 def carry_mounting(arm: Arm, hand: HandModel) -> Arm:
     """Return the arm with the hand's forearm, its wrist at rest, as a part of the body that carries the mount."""
     if hand.mounting is None:
         return arm
-    root = compose(arm.mount_pose, arm.hand_pose)
-    poses = compose(root, _rest_poses(hand.mounting))
-    pieces = tuple(
-        replace(
-            piece,
-            body=arm.mount_body,
-            pose=compose(poses[piece.body], piece.pose),
-            vertices=apply(poses[piece.body], piece.vertices),
-        )
-        for piece in hand.mounting.pieces
-    )
+    poses = compose(compose(arm.mount_pose, arm.hand_pose), _rest_poses(hand.mounting))
+    pieces = list(arm.model.pieces)
+    for piece in hand.mounting.pieces:
+        pose, vertices = compose(poses[piece.body], piece.pose), apply(poses[piece.body], piece.vertices)
+        pieces.append(replace(piece, body=arm.mount_body, pose=pose, vertices=vertices))
     masses = np.array(arm.model.masses)
     masses[arm.mount_body] += hand.mounting.masses[1:].sum()  # body 0 is the hand's root
-    return replace(arm, model=replace(arm.model, pieces=arm.model.pieces + pieces, masses=masses))
+    return replace(arm, model=replace(arm.model, pieces=tuple(pieces), masses=masses))
 
 
 def base_pose(arm: Arm) -> Floats:

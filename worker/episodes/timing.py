@@ -14,9 +14,10 @@ from graspd.worker.episodes.episode import Robot
 from graspd.worker.episodes.execution import velocity_limits
 from graspd.worker.hands.model import HandModel, JointType
 
-#: Acceleration limit of finger joints [rad/s^2], [m/s^2]; descriptions do not state it.
-FINGER_RAD_S2: Final = 50.0
-FINGER_M_S2: Final = 2.0
+#: Acceleration limits of joints [rad/s^2], [m/s^2]; descriptions do not state them. An arm's is the least that is
+#: published for Franka's Panda.
+ARM_ACCELERATION: Final = (7.5, 2.0)
+FINGER_ACCELERATION: Final = (50.0, 2.0)
 #: Limits of a flying hand's root: velocity [m/s], [rad/s] and acceleration [m/s^2], [rad/s^2].
 FLYING_VELOCITY: Final = (1.0, 3.0)
 FLYING_ACCELERATION: Final = (5.0, 20.0)
@@ -34,14 +35,10 @@ class MotionLimits:
     @classmethod
     def of_robot(cls, robot: Robot) -> "MotionLimits":
         """Return a robot's limits; those that no description states are assumed."""
-        hand = robot.hand
-        revolute = hand.joint_type[hand.joint_body[hand.first_joint]] == JointType.REVOLUTE
-        fingers = _dof_velocity(hand), np.where(revolute, FINGER_RAD_S2, FINGER_M_S2)
-        if robot.arm is None:
-            carrier = np.array(FLYING_VELOCITY), np.array(FLYING_ACCELERATION)
-        else:
-            carrier = _dof_velocity(robot.arm.model), robot.arm.acceleration
-        velocity, acceleration = (np.concatenate(part) for part in zip(carrier, fingers, strict=True))
+        carrier = np.array([FLYING_VELOCITY, FLYING_ACCELERATION])
+        if robot.arm is not None:
+            carrier = _dof_limits(robot.arm.model, ARM_ACCELERATION)
+        velocity, acceleration = np.hstack([carrier, _dof_limits(robot.hand, FINGER_ACCELERATION)])
         return cls(velocity, acceleration, robot.arm is None)
 
     def rates(self, differences: Floats) -> Floats:
@@ -101,6 +98,8 @@ def minimum_jerk(time: Floats) -> Floats:
     return time**3 * (10 - 15 * time + 6 * time**2)
 
 
-def _dof_velocity(tree: HandModel) -> Floats:
-    lead = tree.first_joint
-    return velocity_limits(tree).velocity[lead] / np.abs(tree.multiplier[tree.joint_body[lead]])
+def _dof_limits(tree: HandModel, acceleration: tuple[float, float]) -> Floats:
+    """Return velocity and acceleration limits (2, D) of dofs."""
+    lead = tree.joint_body[tree.first_joint]
+    velocity = velocity_limits(tree).velocity[tree.first_joint] / np.abs(tree.multiplier[lead])
+    return np.stack([velocity, np.where(tree.joint_type[lead] == JointType.REVOLUTE, *acceleration)])

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graspd.service.model.transforms import quat_from_axis_angle, quat_multiply
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import inherited_attributes, read_shard, write_shard
 from graspd.worker.episodes.episode import Episode, Robot
@@ -128,11 +129,17 @@ def test_grasps_without_a_scene_and_other_files_end_with_one_line(table: Path, t
     assert "is needed here" in refused("episodes replay", table)
 
 
-@pytest.mark.parametrize(("aside", "outcome"), [(0.01, "SUCCEEDED"), (0.03, "TOUCHED")])
-def test_a_neighbour_may_move_by_2_cm(table: Path, aside: float, outcome: str) -> None:
+@pytest.mark.parametrize(
+    ("aside", "turned", "outcome"), [(0.01, 10, "SUCCEEDED"), (0.03, 0, "TOUCHED"), (0, 20, "DROPPED")]
+)
+def test_a_neighbour_may_move_by_2_cm_and_the_object_turn_by_15_degrees(
+    table: Path, aside: float, turned: float, outcome: str
+) -> None:
     shard = read_shard(create(table, "--limit 1", "one.h5")[1])
     hand, obj, placed = hand_of_shard(shard, None), object_of_shard(shard, None), scenes_of_shard(shard)
     simulation, (episode,) = Simulation(Robot(hand), obj, decompose(obj), placed, fps=15), episodes_of_shard(shard)
-    beside = episode.neighbour_pose.copy()
+    beside, thing = episode.neighbour_pose.copy(), episode.object_pose.copy()
     beside[-1, 0, 0] += aside
-    assert simulation.outcome(replace(episode, neighbour_pose=beside)).name == outcome
+    turn = quat_from_axis_angle(np.array([0, 0, 1.0]), np.radians(turned))
+    thing[-1, 3:] = quat_multiply(turn, thing[-1, 3:])
+    assert simulation.outcome(replace(episode, neighbour_pose=beside, object_pose=thing)).name == outcome
