@@ -7,11 +7,11 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from pydantic import ValidationError
 
-from graspd.api.access.auth import ForeignResource, caller, caller_id, project_scope, require_ownership
+from graspd.api.access.auth import ForeignResource, InScope, caller, caller_id, project_scope, require_ownership
 from graspd.api.access.quotas import Idempotency, Quotas
 from graspd.api.catalog.grasps import Grasps
 from graspd.api.models import Job, JobDetail, MeanMetrics, Shard, StageStatus, stage_state
@@ -46,15 +46,9 @@ class Shards:
         self._services = services
         self._checked = CheckedObjects(services.store)
 
-    def page(
-        self,
-        *,
-        job: str | None = None,
-        kind: Literal["base", "scene", "views"] | None = None,
-        limit: int = 50,
-        cursor: str | None = None,
-    ) -> Page[Shard]:
-        page = self._services.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor, scope=project_scope())
+    def page(self, **wanted: Any) -> Page[Shard]:
+        """Return a page of shards; `wanted` has the filters and the paging of the index."""
+        page = self._services.index.shards.page(**wanted, scope=project_scope())
         return Page[Shard](items=[_shard_model(shard) for shard in page.items], next=page.next)
 
     def get(self, shard_id: str) -> Shard:
@@ -77,8 +71,7 @@ class Shards:
         """Yield bytes of the file in chunks; DamagedShard if they changed since the check of the file."""
         return self._checked.stream(shard.key, shard.sha256, start, length)
 
-    def job_of(self, shard_id: str) -> str | None:
-        return self._services.index.shards.job_of(shard_id, scope=project_scope())
+    job_of = InScope(lambda index: index.shards.job_of)
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
         return self._services.index.shards.assets_of(ids)
@@ -136,20 +129,9 @@ class Jobs:
             deletion.delete_job(self._services, job_id, owner=caller_id())
             log.info("job deleted")
 
-    def page(
-        self,
-        *,
-        state: State | None = None,
-        hand: str | None = None,
-        object: str | None = None,
-        prefix: str = "",
-        limit: int = 50,
-        cursor: str | None = None,
-        **order: Any,
-    ) -> Page[Job]:
-        """Return a page of jobs; `order` has `words`, `sort` and `descending` of the index."""
-        wanted = {"state": state, "hand": hand, "object": object, "prefix": prefix, **order}
-        page = self._services.index.jobs.page(**wanted, limit=limit, cursor=cursor, scope=project_scope())
+    def page(self, **wanted: Any) -> Page[Job]:
+        """Return a page of jobs; `wanted` has the filters, the order and the paging of the index."""
+        page = self._services.index.jobs.page(**wanted, scope=project_scope())
         return Page[Job](items=[self._job_model(job, ()) for job in page.items], next=page.next)
 
     def get(self, job_id: str) -> JobDetail:

@@ -48,7 +48,6 @@ def _render_list(request: Request, assets: Assets, kind: AssetKind, cursor: str 
     return render(
         request,
         "assets.html",
-        page=f"/{kind.value}s",
         poll_s=2 * _CHECK_S,
         kind=kind.value,
         assets=[(one, _short_facts(assets, one)) for one in page.items],
@@ -90,7 +89,6 @@ def object_page(request: Request, name: str, assets: AssetsOf) -> HTMLResponse:
     return render(
         request,
         "object.html",
-        page="/objects",
         poll_s=0 if checked else _CHECK_S,
         object=found,
         checked=checked,
@@ -135,7 +133,6 @@ def _render_hand(
         request,
         "hand.html",
         status=status,
-        page="/hands",
         poll_s=_CHECK_S if waits else 0,
         hand=hand,
         facts=facts,

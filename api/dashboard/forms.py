@@ -192,7 +192,6 @@ def _render_form(
         request,
         "submit.html",
         status=status,
-        page="/submit",
         form={"units": "m"} | form,
         errors=(errors := dict.fromkeys([*DEFAULTS, "file", "hand_file"], "") | (errors or {})),
         problem=problem,

@@ -18,7 +18,7 @@ from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.queue.port import rq_id
 from graspd.service.settings import Settings
-from tests.api.factories import add_job, fail, finish, finish_all, people_of
+from tests.api.factories import add_job, finish, finish_all, people_of
 from tests.fakes import fail_task, plan_all
 
 NEVER = "9999-01-01T00:00:00Z"
@@ -185,8 +185,3 @@ def test_the_search_finds_everything_and_leads_there(http: TestClient, services:
         answer = http.get(f"/search?q={text}&go=true", follow_redirects=False)
         assert answer.headers["location"] == address
     assert "Nothing has this name" in http.get("/search?q=zzz&go=true").text
-
-
-def test_a_failed_job_has_its_reason_in_the_list(http: TestClient, services: Services) -> None:
-    fail(services, add_job(services), "the mesh has 12 open edges")
-    assert "the mesh has 12 open edges" in http.get("/jobs?state=failed").text

@@ -1,7 +1,6 @@
 """Files of episodes: `graspd episodes create` and `replay` on grasps of a block with another one beside it."""
 
 from dataclasses import replace
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
