@@ -86,6 +86,7 @@ class JobDetail(Job):
     choice: FidelityChoice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
     note: str | None = Field(None, description="why fewer grasps than requested were found; null if enough")
     outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
+    episodes: dict[str, int] = Field({}, description="episodes by outcome")
     phases: dict[str, float] = Field({}, description="time of each phase of synthesis [s]: planner, validation, ...")
     seconds_by_device: dict[str, float] = Field({}, description="time of finished tasks by device, without reused [s]")
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
@@ -189,6 +190,15 @@ class Push(BaseModel):
 
     direction: str
     outcome: str
+
+
+class GraspEpisode(BaseModel):
+    """Execution of a grasp by a robot."""
+
+    shard_id: str = Field(description="episodes shard")
+    robot: str = Field(description="flying: the hand alone; else the arm")
+    outcome: str = Field(description="succeeded, or why not")
+    films: dict[str, str] = Field(description="address of the film of each camera, if the grasp was executed")
 
 
 class GraspDetail(GraspView):
@@ -297,5 +307,6 @@ STAGE_LABELS: dict[Stage, str] = {
     Stage.SYNTHESIZE: "Synthesize",
     Stage.SCENE: "Scene",
     Stage.RENDER: "Render",
+    Stage.EPISODE: "Episode",
     Stage.INGEST: "Check",
 }

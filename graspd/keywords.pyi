@@ -13,6 +13,7 @@ class JobKeywords(TypedDict, total=False):
     neighbours: Sequence[str | Mapping[str, Any]]
     scenes: int
     views: int
+    episodes: Literal["none", "flying", "ur10e", "franka"]
     type: Literal[
         "any",
         "balanced",
@@ -50,6 +51,8 @@ class JobKeywords(TypedDict, total=False):
     width: int
     height: int
     channels: Sequence[Literal["distance", "normals", "occlusion"]]
+    film: Sequence[Literal["scene", "wrist"]]
+    episode_fps: int
     digits: Sequence[Literal["thumb", "index", "middle", "ring", "little", "sixth"]]
     touch_region: str
     avoid_region: str

@@ -30,7 +30,7 @@ from graspd.service.model.scene_spec import scene_supports
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.pipeline.backends import Services
 from graspd.service.readers.trajectories import planned_scene_of, slider_positions, trajectory_of
-from graspd.service.store.columns import LIFT_OUTCOMES, PUSH_OUTCOMES
+from graspd.service.store.columns import EXECUTED, LIFT_OUTCOMES, PUSH_OUTCOMES
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import Shard, read_shard
 
@@ -163,6 +163,19 @@ class Grasps:
             recheck=_optional_flag(file, "quality/recheck", row),
             friction=_finite_or_none(file.attributes.get("mu")),
         )
+
+    def episodes(self, shard_id: str, row: int) -> list[models.GraspEpisode]:
+        """Return the episodes of a grasp, newest first."""
+        self._index.grasps.get(shard_id, row, scope=project_scope())
+        found = []
+        for shard in self._index.shards.episodes_of(shard_id, scope=project_scope()):
+            request, outcomes = (shard.manifest.get(name, {}) for name in ("request", "episodes"))
+            if outcome := outcomes.get(str(row)):
+                cameras = request.get("film", ()) if outcome in EXECUTED else ()
+                films = {camera: f"/v1/shards/{shard.id}/films/{row}/{camera}" for camera in cameras}
+                robot = request["episodes"]
+                found.append(models.GraspEpisode(shard_id=shard.id, robot=robot, outcome=outcome, films=films))
+        return found
 
     def _read_shard(self, key: str, sha256: str) -> Shard:
         data = read_checked(self._store, key, sha256)

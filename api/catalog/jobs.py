@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any, Final
 
+import numpy as np
 from pydantic import ValidationError
 
 from graspd.api.access.auth import ForeignResource, InScope, caller, caller_id, project_scope, require_ownership
@@ -25,9 +26,10 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.spec import Estimate, Matrix
 from graspd.service.queue.port import rq_id
-from graspd.service.store.integrity import CheckedObjects
+from graspd.service.store.integrity import CheckedObjects, read_checked
 from graspd.service.store.manifests import load_manifest
 from graspd.service.store.records import task_attempts
+from graspd.service.store.shards import open_shard
 from graspd.service.telemetry import bind_subjects
 
 log = logging.getLogger(__name__)
@@ -72,6 +74,16 @@ class Shards:
         return self._checked.stream(shard.key, shard.sha256, start, length)
 
     job_of = InScope(lambda index: index.shards.job_of)
+
+    def film(self, shard_id: str, row: int, camera: str) -> bytes:
+        """Return the video of a grasp's episode; NotFoundError if it was not executed or not filmed."""
+        shard = self.get(shard_id)
+        with open_shard(read_checked(self._services.store, shard.key, shard.sha256), name=shard.key) as file:
+            if f"video/{camera}" in file and row in (rows := file["episode/row"][:].tolist()):
+                ends, place = np.cumsum(file[f"video/{camera}_bytes"][:]), rows.index(row)
+                if film := file[f"video/{camera}"][ends[place - 1] if place else 0 : ends[place]].tobytes():
+                    return bytes(film)
+        raise errors.NotFoundError(f"shard {shard_id} has no film of grasp {row} by a camera {camera!r}")
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
         return self._services.index.shards.assets_of(ids)

@@ -177,6 +177,7 @@ def grasp_page(
         ],
         type=GraspType(int(grasp.grasp_type or 0)),
         weakest=_WEAKEST.get(grasp.robust_weakest or ""),
+        episodes=grasps.episodes(shard_id, row),
         swept=[metric for metric in GRASP_METRICS if metric.name in grasp.sweep],
     )
 

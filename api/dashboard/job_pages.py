@@ -18,6 +18,7 @@ from graspd.api.routes.dependencies import READ, GraspsOf, JobsOf, ShardsOf, Tag
 from graspd.service.model.errors import NotFoundError
 from graspd.service.model.planning import OUTCOMES, phase_seconds
 from graspd.service.settings import Settings
+from graspd.service.store.columns import EXECUTED
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import open_shard
 from graspd.service.store.store import Store
@@ -55,6 +56,7 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         job=job,
         tasks=jobs.tasks(job_id),
         rejected={OUTCOMES.get(name, name): number for name, number in job.outcomes.items()},
+        executed=sum(job.episodes.get(outcome, 0) for outcome in EXECUTED),
         reused=sum(stage.reused for stage in job.stages),
         task_count=sum(stage.tasks for stage in job.stages),
         expected=jobs.estimate(job),

@@ -29,6 +29,12 @@ async def replay_grasp(request: Request, shard_id: str, row: int, grasps: Grasps
     return Response(found, media_type="application/json", headers=_KEPT)  # type: ignore[return-value]
 
 
+@router.get("/{shard_id}/{row}/episodes", dependencies=READ)
+def list_episodes(shard_id: str, row: int, grasps: GraspsOf) -> list[models.GraspEpisode]:
+    """List the episodes of one grasp, newest first, with the addresses of their films."""
+    return grasps.episodes(shard_id, row)
+
+
 @router.get(
     "/export",
     dependencies=READ,

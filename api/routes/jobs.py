@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import AsyncIterable
-from typing import Annotated, Literal
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import RedirectResponse, StreamingResponse
@@ -24,6 +24,7 @@ from graspd.api.routes.dependencies import (
 from graspd.service.index.views import Page
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.states import State
+from graspd.service.store.columns import ShardKind
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
@@ -109,7 +110,7 @@ def list_shards(
     shards: ShardsOf,
     paging: PagingOf,
     job: Annotated[str | None, Query(max_length=64)] = None,
-    kind: Literal["base", "scene", "views"] | None = None,
+    kind: ShardKind | None = None,
 ) -> Page[Shard]:
     """List shards, all or those of a job."""
     return paging.add_next_link(shards.page(job=job, kind=kind, limit=paging.limit, cursor=paging.cursor))
@@ -119,6 +120,18 @@ def list_shards(
 def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
     """Return a shard with its whole manifest."""
     return shards.get(shard_id)
+
+
+@shard_router.get(
+    "/{shard_id}/films/{row}/{camera}",
+    dependencies=READ,
+    response_class=Response,
+    responses={200: {"content": {"video/mp4": {}}, "description": "The video"}},
+)
+def get_film(shard_id: str, row: int, camera: str, shards: ShardsOf) -> Response:
+    """Send the film of one camera of the episode of a grasp, by its row in the base shard."""
+    headers = {"Cache-Control": "private, max-age=31536000, immutable"}
+    return Response(shards.film(shard_id, row, camera), media_type="video/mp4", headers=headers)
 
 
 @shard_router.head("/{shard_id}/file", dependencies=READ, include_in_schema=False)

@@ -101,7 +101,7 @@ def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True)
 _SUMMARY: Final = (
     *("grasps", "valid", "candidates", "validated", "valid_yield", "rechecked", "recheck_held"),
     *("second_tested", "second_held"),
-    *("note", "progress", "reason", "outcomes"),
+    *("note", "progress", "reason", "outcomes", "episodes"),
 )
 
 
@@ -172,6 +172,8 @@ def _print_job(job: JobDetail, url: str) -> None:
     console.print(table)
     if job.grasps:
         console.print(f"{yield_of(job)}; {mean_metrics(job)}")
+        if job.episodes:
+            console.print(f"episodes: {', '.join(f'{count(number)} {name}' for name, number in job.episodes.items())}")
         if found := job.diversity:
             types = ", ".join(f"{count(number)} {name}" for name, number in found.types.items())
             directions = f"{found.directions_used} of {found.directions} directions"

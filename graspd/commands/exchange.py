@@ -49,9 +49,7 @@ def export(
         str | None, typer.Option("--tool-frame", help="For robots: link of the hand, or x y z qw qx qy qz in its root.")
     ] = None,
     speed: Annotated[float, typer.Option(help="For robots: share of the velocity limits.")] = 0.5,
-    arm: Annotated[
-        str | None, typer.Option(help="For robots: ur10e, franka or a URDF; selects grasps in its reach.")
-    ] = None,
+    arm: Annotated[str | None, typer.Option(help="For robots: ur10e, franka or a URDF; grasps in reach.")] = None,
     mount: Annotated[str | None, typer.Option(help="Link of the arm on which the hand is mounted.")] = None,
     base: Annotated[
         str | None, typer.Option(help="Pose of the arm's base in the scene or object frame: x y z qw qx qy qz.")

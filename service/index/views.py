@@ -74,6 +74,7 @@ class JobView(Validated):
     second_tested: int = Field(0, description="valid grasps that the second engine validated")
     second_held: int = Field(0, description="those that it held")
     outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
+    episodes: dict[str, int] = Field({}, description="episodes by outcome")
     phases: dict[str, float] = Field({}, description="time of each phase of synthesis [s]: planner, validation, ...")
     seconds_by_device: dict[str, float] = Field({}, description="time of finished tasks by device, without reused [s]")
 
@@ -120,14 +121,14 @@ class AttemptView(View):
 
 class ShardView(View):
     id: str
-    kind: str = Field(description="base, scene or views")
+    kind: str = Field(description="base, scene, views or episodes")
     stage: Stage
     key: str
     sha256: str
     size_bytes: int
     count: int = Field(
         description="base shard: grasps; scene shard: transferred grasps, or scenes if grasps are planned in them; "
-        "views shard: pictures"
+        "views shard: pictures; episodes shard: executed and refused grasps"
     )
     hand: str
     object: str

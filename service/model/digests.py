@@ -86,6 +86,9 @@ def shard_id(
             }
     elif stage is Stage.RENDER:
         inputs_of |= {k: getattr(request, k) for k in ("views", "stereo", "width", "height", "channels")}
+    elif stage is Stage.EPISODE:
+        inputs_of |= {k: getattr(request, k) for k in ("episodes", "film", "episode_fps")}
+        inputs_of |= {k: getattr(request, k) for k in ("width", "height") if request.film}
     return digest_json(inputs_of)
 
 
@@ -112,5 +115,7 @@ def _validation_inputs(request: JobRequest, batches: range) -> dict[str, object]
 def job_id(request: JobRequest, hand_digest: str, object_digest: str, project: str = "") -> str:
     """Return the id of a job: equal requests for the same hand, object and project are one job."""
     original = original_request(request.model_dump(mode="json"))
-    inputs = {"request": original, "hand": hand_digest, "object": object_digest, "revisions": STAGE_REVISIONS}
+    # Jobs without episodes keep their ids from before this stage.
+    revisions = {k: v for k, v in STAGE_REVISIONS.items() if k != Stage.EPISODE or request.has_episodes}
+    inputs = {"request": original, "hand": hand_digest, "object": object_digest, "revisions": revisions}
     return digest_json(inputs | ({"project": project} if project else {}))

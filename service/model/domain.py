@@ -32,7 +32,7 @@ from graspd.service.model.scene_spec import (
     has_table,
 )
 from graspd.service.model.states import AssetKind
-from graspd.service.model.version import SCHEMA_OF_ENGINES
+from graspd.service.model.version import SCHEMA_OF_ENGINES, SCHEMA_OF_EPISODES
 
 #: Grasps per batch, the unit of seeds and kernel launches.
 BATCH_SIZE: Final = 32
@@ -61,6 +61,7 @@ _LEVEL_LABELS: Final = {
 _FACE_LABELS: Final = {"drawn": "as dropped", "all": "every stable face"}
 _WANT_LABELS: Final = {"valid": "valid grasps", "candidates": "all candidates"}
 _FIDELITY_HINT: Final = "draft: fastest; fine: most accurate; auto: meets the target"
+_CARRIER_LABELS: Final = {"none": "none", "flying": "flying hand", "ur10e": "UR10e", "franka": "Franka"}
 _SCENE_LABELS: Final = {"free": "free object", "table": "table", "bin": "bin", "shelf": "shelf"}
 _ENGINE_LABELS: Final = {"none": "none", "physx": "PhysX", "drake": "Drake", "all": "PhysX and Drake"}
 _TYPE_LABELS: Final = {name: name.replace("_", " ") for name in get_args(GraspTypeName)}
@@ -86,6 +87,9 @@ FORM: Final[dict[str, FormField]] = {
     "channels": FormField(
         "Pictures", "Further channels", "besides colour, depth and labels", placeholder="distance, normals"
     ),
+    "episodes": FormField("Episodes", "Robot", "executes each valid grasp", _CARRIER_LABELS, cells=True),
+    "film": FormField("Episodes", "Film", "cameras; empty: no film", placeholder="scene, wrist"),
+    "episode_fps": FormField("Episodes", "Frame rate", "of states and films"),
     "type": FormField("Grasp", "Grasp type", "", _TYPE_LABELS, cells=True),
     "digits": FormField("Grasp", "Digits", "that may touch; empty: all", placeholder="thumb, index"),
     "touch_region": FormField("Grasp", "Contact region", "bounds, part or colour", placeholder="z > 0.05", cells=True),
@@ -190,6 +194,17 @@ class JobOptions(Model):
     height: Annotated[int, Option(places=JOB)] = _field(240, "picture height [px]", ge=16, le=4096)
     channels: Annotated[tuple[Literal["distance", "normals", "occlusion"], ...], Option(places=JOB)] = _field(
         (), "image channels besides colour, depth and segmentation: distance, normals or occlusion"
+    )
+    episodes: Annotated[
+        Literal["none", "flying", "ur10e", "franka"], Option("basic", JOB, schema=SCHEMA_OF_EPISODES)
+    ] = _sparse_field(
+        "none", "robot that executes each valid grasp in its scene: flying (the hand alone), ur10e or franka"
+    )
+    film: Annotated[tuple[Literal["scene", "wrist"], ...], Option(places=JOB, schema=SCHEMA_OF_EPISODES)] = (
+        _sparse_field((), "cameras that film the episodes: scene or wrist")
+    )
+    episode_fps: Annotated[int, Option(places=JOB, schema=SCHEMA_OF_EPISODES)] = _sparse_field(
+        15, "frames of an episode [1/s]", ge=10, le=30
     )
     type: Annotated[GraspTypeName, Option("basic", schema=7)] = _sparse_field(
         "any",
@@ -299,11 +314,11 @@ class JobOptions(Model):
             resolve_fidelity(value)
         return value
 
-    @field_validator("channels")
+    @field_validator("channels", "film")
     @classmethod
     def _sort_channels(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        # The order of channels must not change the id of the job.
-        return tuple(name for name in EXTRA_CHANNELS if name in value)
+        # The order of channels or cameras must not change the id of the job.
+        return tuple(name for name in (*EXTRA_CHANNELS, "scene", "wrist") if name in value)
 
     @model_validator(mode="before")
     @classmethod
@@ -332,6 +347,12 @@ class JobOptions(Model):
             raise ValueError(f"method {self.method} plans any grasps: {name} requires method fast_graspd")
         if self.views and not self.scenes:
             raise ValueError("views need scenes: set scenes >= 1")
+        if self.has_episodes and not self.in_scene:
+            raise ValueError("free grasps have no episodes: choose a scene, such as table")
+        if self.film and not self.has_episodes:
+            raise ValueError("film shows episodes: choose a robot for them, such as flying")
+        if self.film and (self.width % 2 or self.height % 2):
+            raise ValueError(f"a film of {self.width} x {self.height} cannot be encoded: choose even numbers")
         if self.validation == "none":
             self._check_without_validation()
         return self
@@ -359,6 +380,8 @@ class JobOptions(Model):
             raise ValueError("payload is measured by a validator: choose one")
         if self.shake:
             raise ValueError("shake is simulated by a validator: choose one")
+        if self.has_episodes:
+            raise ValueError("episodes execute valid grasps: choose a validator")
 
     @property
     def requirements(self) -> dict[str, Any]:
@@ -417,6 +440,10 @@ class JobOptions(Model):
     @property
     def in_scene(self) -> bool:
         return self.scene != "free"
+
+    @property
+    def has_episodes(self) -> bool:
+        return self.episodes != "none"
 
     @property
     def resolved_fidelity(self) -> Fidelity:

@@ -23,7 +23,12 @@ SERVICE: Final = "service"
 MARKS: Final = "marks"
 
 #: Kind of the shards of each stage: folder below `shards/` and HDF5 kind.
-SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
+SHARD_KINDS: Final[dict[Stage, str]] = {
+    Stage.SYNTHESIZE: "base",
+    Stage.SCENE: "scene",
+    Stage.RENDER: "views",
+    Stage.EPISODE: "episodes",
+}
 STAGES: Final = {kind: stage for stage, kind in SHARD_KINDS.items()}
 
 #: Formats of keys and folders; each takes ids, names and numbers in the order of its places.

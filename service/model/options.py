@@ -27,7 +27,7 @@ _UNIT: Final = re.compile(r"\[([^\]]+)\]")
 class FormField:
     """Input of an option in a dashboard form."""
 
-    group: Literal["", "Planning", "Grasp", "Object", "Scene", "Validation", "Pictures"]
+    group: Literal["", "Planning", "Grasp", "Object", "Scene", "Validation", "Pictures", "Episodes"]
     """Title of a group of advanced options; empty: the form shows the option first."""
     label: str
     hint: str = ""

@@ -1,7 +1,7 @@
 """Planning of jobs in pure functions: tasks and their states, fair scheduling, outcomes of candidates.
 
 A job is split into batches of `BATCH_SIZE` grasps. Each range of `JobRecord.span` batches has one task per requested
-stage: synthesize -> scene -> render, or for grasps planned in scenes: scene -> synthesize -> render.
+stage: synthesize -> scene -> render, or for grasps planned in scenes: scene -> synthesize -> render -> episode.
 """
 
 import math
@@ -57,7 +57,7 @@ def priority_of(request: JobRequest) -> Priority:
 def stages_of(request: JobOptions) -> tuple[Stage, ...]:
     render = (Stage.RENDER,) if request.views else ()
     if request.in_scene:
-        return (Stage.SCENE, Stage.SYNTHESIZE, *render)
+        return (Stage.SCENE, Stage.SYNTHESIZE, *render, *((Stage.EPISODE,) if request.has_episodes else ()))
     return (Stage.SYNTHESIZE, *((Stage.SCENE,) if request.scenes else ()), *render)
 
 
@@ -81,7 +81,8 @@ def plan_tasks(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedT
             facts = digests | {"batch": batch, "count": count, "revision": job.revisions[stage], "inputs": inputs}
             output = shard_id(stage, request=request, **facts)
             yield PlannedTask(task_id(job.id, stage, batch), stage, batch, count, inputs, output)
-            inputs = (output,)
+            # Stages after the grasps read these.
+            inputs = inputs if stage is Stage.RENDER else (output,)
 
 
 def create_task_message(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:

@@ -70,8 +70,8 @@ class JobRecord(Record):
     @model_validator(mode="after")
     def _check_digests(self) -> Self:
         check_digests(self.request)
-        if self.span > 1 and self.request.views:
-            raise ValueError("a task of a job with pictures has one batch")
+        if self.span > 1 and (self.request.views or self.request.has_episodes):
+            raise ValueError("a task of a job with pictures or episodes has one batch")
         return self
 
     @property
@@ -184,7 +184,7 @@ class DatasetEvent(Record):
 
 class SnapshotShard(Record):
     id: Digest
-    kind: Literal["base", "scene", "views"]
+    kind: Literal["base", "scene", "views", "episodes"]
     key: str
     sha256: str
     size_bytes: int

@@ -24,6 +24,7 @@ class Stage(StrEnum):
     SYNTHESIZE = "synthesize"
     SCENE = "scene"
     RENDER = "render"
+    EPISODE = "episode"
 
 
 class AssetKind(StrEnum):

@@ -79,7 +79,7 @@ FOLDERS: Final = (
     *(names.MARKS, names.SERVICE, names.REMOVED),
 )
 _SEALED: Final = (".json", ".zip", ".npz", ".glb")
-_SHARD: Final = re.compile(r"shards/(base|scene|views)/([0-9a-f]{32})\.(h5|json)")
+_SHARD: Final = re.compile(rf"shards/({'|'.join(names.STAGES)})/([0-9a-f]{{32}})\.(h5|json)")
 MISSING: Final = "its file is missing"
 NO_MANIFEST: Final = "it has no manifest"
 BAD_MANIFEST: Final = "its manifest is damaged"

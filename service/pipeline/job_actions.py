@@ -69,8 +69,8 @@ class TaskRanges:
     def with_span(self, job: JobRecord, *, among: int = 1) -> JobRecord:
         """Return a job with its number of batches per task, `span`; `among` jobs share the workers."""
         batches, wanted_s = count_batches(job.request.grasps), self._services.settings.task_s
-        # The shard with pictures of a single batch already has megabytes.
-        if batches == 1 or job.request.views or not wanted_s:
+        # The shard with pictures or films of a single batch already has megabytes.
+        if batches == 1 or job.request.views or job.request.has_episodes or not wanted_s:
             return job
         if self._clock() >= self._read_again:
             self._workers = self._services.queue.workers()

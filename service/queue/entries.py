@@ -135,7 +135,7 @@ def is_entry_error(error: Exception) -> bool:
 LISTS: Final[str] = Queue.redis_queues_keys
 RQ_WORKERS: Final[str] = Worker.redis_workers_keys
 #: Order in which a worker reads stages: later stages first, so that started batches finish before new ones start.
-_STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
+_STAGE_ORDER: Final = (Stage.INGEST, Stage.EPISODE, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
 #: Maximum number of separate lists; further names are ignored.
 _MOST_APART: Final = 64
 _APART: Final = re.compile(rf"(.+?)\.([0-9]{{1,4}})\.([0-9]{{1,4}})((?:\.(?:{'|'.join(ENGINES[1:])}))*)")

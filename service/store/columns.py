@@ -72,6 +72,7 @@ LIFT_OUTCOMES: Final = dict(enumerate((*_LIFT_OUTCOMES, "rotated", "diverged", "
 #: Meanings of `worker.episodes.episode.EpisodeOutcome`; grasps with the last four were not executed.
 _EPISODE_OUTCOMES = ("succeeded", "touched", "not lifted", "dropped", "diverged", "out of reach")
 EPISODE_OUTCOMES: Final = dict(enumerate((*_EPISODE_OUTCOMES, "no continuous motion", "collision", "no transit")))
+EXECUTED: Final = _EPISODE_OUTCOMES[:5]
 #: Meanings of the codes of phases, `worker.episodes.episode.PHASES`.
 _PHASES = ("transit", "approach", "shape", "close", "squeeze", "lift", "hold")
 EPISODE_PHASES: Final = dict(enumerate(_PHASES))

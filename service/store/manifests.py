@@ -21,7 +21,7 @@ from graspd.service.model.records import Record
 from graspd.service.model.states import Stage
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from graspd.service.store import validity
-from graspd.service.store.columns import SCHEMAS, ShardKind, schema_name
+from graspd.service.store.columns import EPISODE_OUTCOMES, SCHEMAS, ShardKind, schema_name
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.records import put_record, read_record
 from graspd.service.store.shards import Shard, read_shard
@@ -52,7 +52,9 @@ class ShardManifest(Record):
     key: str
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
     size_bytes: int = Field(gt=0)
-    counts: dict[str, int] = Field(description="lengths of the shard's axes: N grasps, S scenes, K pairs, V views")
+    counts: dict[str, int] = Field(
+        description="lengths of the shard's axes: N grasps, S scenes, K pairs, V views, E episodes"
+    )
     hand: str
     object: str
     hand_digest: Digest
@@ -69,12 +71,19 @@ class ShardManifest(Record):
     device: str
     seconds: float
     worker: str
-    valid: int = Field(0, description="base: valid grasps; scene: pairs of grasp and scene in which the hand is clear")
+    valid: int = Field(
+        0,
+        description="base: valid grasps; scene: pairs of grasp and scene in which the hand is clear; "
+        "episodes: successful ones",
+    )
     candidates: int = Field(0, ge=0, description="candidates planned for this base shard, stored or not")
     rechecked: int = Field(0, ge=0, description="valid grasps validated again at level `dexgraspbench`")
     recheck_held: int = Field(0, ge=0, description="rechecked grasps that held")
     index_threshold_m: float | None = None
     grasps: tuple[GraspSummary, ...] = ()
+    episodes: dict[int, str] = Field(
+        {}, exclude_if=lambda value: not value, description="outcome of each episode, by the grasp's row in its shard"
+    )
     info: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -91,9 +100,9 @@ class ShardManifest(Record):
 
     @property
     def count(self) -> int:
-        """Number of grasps, views, scenes, or pairs of grasp and scene, according to the kind."""
+        """Number of grasps, views, episodes, scenes, or pairs of grasp and scene, according to the kind."""
         scenes = "S" if self.request.in_scene else "K"
-        return self.counts.get({"base": "N", "scene": scenes, "views": "V"}[self.kind], 0)
+        return self.counts.get({"base": "N", "scene": scenes, "views": "V", "episodes": "E"}[self.kind], 0)
 
 
 def create_manifest(
@@ -137,6 +146,10 @@ def create_manifest(
 
 
 def _content_fields(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> dict[str, Any]:
+    if kind == "episodes":
+        outcomes = [EPISODE_OUTCOMES[code] for code in arrays["episode/outcome"].tolist()]
+        episodes = dict(zip(arrays["episode/row"].tolist(), outcomes, strict=True))
+        return {"episodes": episodes, "valid": outcomes.count(EPISODE_OUTCOMES[0])}
     valid = validity.valid_mask(arrays) if kind == "base" else arrays.get("grasp/valid")
     fields: dict[str, Any] = {"valid": 0 if valid is None else int(np.count_nonzero(valid))}
     if kind == "base":
@@ -195,7 +208,7 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
 
 def rebuild_manifest(said: Mapping[str, Any], data: bytes) -> ShardManifest:
     """Return the manifest of the shard `data`; other fields come from the existing manifest `said`."""
-    pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
+    pictures = tuple(path for kind in SCHEMAS for path in SCHEMAS[kind] if path.startswith(("image/", "video/")))
     shard = read_shard(data, without=pictures, name=said["key"])
     file = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}
     content = _content_fields(said["kind"], shard.arrays, shard.attributes)

@@ -193,7 +193,9 @@ COLUMNS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "scene": ("grasp/base_index", "grasp/hand_pose", "grasp/valid", "grasp/rejection", "scene/object_pose"),
     "views": (),
+    "episodes": ("episode/outcome",),
 }
+_ROWS: Final = {"base": "quality/valid", "scene": "grasp/valid", "views": "camera/eye", "episodes": "episode/outcome"}
 _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 _AT_ONCE: Final = 64
 _THREADS: Final = 8
@@ -232,7 +234,7 @@ def _read_shard_file(contents: Contents, file: ShardFile, size: int | None) -> S
     with open_shard(path) as opened:
         said = {key: _json_value(value) for key, value in opened.attrs.items()}
         columns = {name: read_column(opened, name, str(path)) for name in COLUMNS[file.kind] if name in opened}
-        rows = len(opened[{"base": "quality/valid", "scene": "grasp/valid", "views": "camera/eye"}[file.kind]])
+        rows = len(opened[_ROWS[file.kind]])
     found = ShardContents(file, columns, said, size or path.stat().st_size, rows)
     if unopened is None:
         return found

@@ -9,6 +9,7 @@ from pydantic_core import from_json
 from graspd.service.model.clock import timestamp
 from graspd.service.model.grasp_types import TAXONOMY
 from graspd.service.model.metrics import DIRECTION_CELLS, GRASP_METRICS, GraspType, entropy_bits, evenness
+from graspd.service.model.names import SHARD_KINDS
 from graspd.service.model.states import AssetKind
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.studies.cards.contents import AssetFacts, Contents
@@ -26,7 +27,7 @@ REJECTIONS: Final = {
     4: "a neighbour on the approach",
 }
 _PERCENTILES: Final = {"p5": 5, "p25": 25, "median": 50, "p75": 75, "p95": 95}
-_KINDS: Final = ("base", "scene", "views")
+_KINDS: Final = tuple(SHARD_KINDS.values())
 
 
 def card_content(contents: Contents, tally: Tally, *, licence: str = "", source: str = "") -> Row:
@@ -147,6 +148,7 @@ def _validity(cell: CellTally) -> Row:
         "second_tested": n["second_tested"],
         "second_held": share(n["second_held"], n["second_tested"]),
         "lift_hard": share(n["lift_hard"], n["lift_tested"]),
+        "episodes": share(n["episodes_succeeded"], n["episodes"]),
         "seconds": round(cell.seconds, 3),
     }
 

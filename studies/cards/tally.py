@@ -154,7 +154,7 @@ _ATTRIBUTES: Final = (
 
 
 def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
-    """Return the sums over all shards; those of a batch are in the order base, scene, views."""
+    """Return the sums over all shards; those of a batch are in the order of `SHARD_KINDS`."""
     tally = Tally()
     valid: dict[str, Array] = {}
     batch_now: tuple[Pair, int] | None = None
@@ -184,6 +184,9 @@ def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
             valid[piece.file.id] = _add_base(tally, cell, piece, hand)
         elif piece.file.kind == "scene":
             _add_scene(tally, cell, piece, hand, valid)
+        elif piece.file.kind == "episodes":
+            lifted = int(np.count_nonzero(piece.columns["episode/outcome"] == 0))
+            cell.n.update(episodes=piece.rows, episodes_succeeded=lifted)
         else:
             cell.n["pictures"] += piece.rows
     return tally

@@ -55,7 +55,7 @@ def finish(services: Services, record: JobRecord, task: PlannedTask, **info: obj
     attributes: dict[str, Attribute] = {"hand": record.request.hand, "object": record.request.object}
     attributes |= {"shard_id": task.output, "batch": task.batch}
     if task.inputs:
-        reads_base = task.stage is (Stage.RENDER if record.request.in_scene else Stage.SCENE)
+        reads_base = task.stage in ((Stage.RENDER, Stage.EPISODE) if record.request.in_scene else (Stage.SCENE,))
         attributes["base_shard" if reads_base else "scene_shard"] = task.inputs[0]
     if task.stage is Stage.SYNTHESIZE:
         attributes["joint_names"] = [f"joint_{i}" for i in range(JOINTS)]
@@ -205,4 +205,20 @@ def _views(random: np.random.Generator, count: int, request: JobRequest) -> Arra
     }
 
 
-_ARRAYS = {Stage.SYNTHESIZE: _base, Stage.SCENE: _scene, Stage.RENDER: _views}
+def _episodes(random: np.random.Generator, count: int, request: JobRequest) -> Arrays:
+    """Episodes of all grasps but the first: most succeed in two frames, every fifth is out of reach."""
+    rows = np.arange(1, count, dtype=np.int32)
+    outcome = np.where(rows % 5, 0, 5).astype(np.uint8)
+    frames = np.where(outcome, 0, 2).astype(np.int32)
+    arrays: Arrays = {"episode/row": rows, "episode/outcome": outcome, "episode/frames": frames}
+    arrays |= {"episode/scene_index": np.zeros(count - 1, np.int32), "scene/object_pose": poses(random, 1)}
+    arrays |= {f"frame/{name}": random.normal(size=(frames.sum(), 7 + JOINTS)) for name in ("state", "action")}
+    arrays |= {"frame/phase": np.zeros(frames.sum(), np.uint8), "frame/object_pose": poses(random, frames.sum())}
+    for camera in request.film:
+        films = [f"{camera} {row}".encode() if number else b"" for row, number in zip(rows, frames, strict=True)]
+        arrays[f"video/{camera}"] = np.frombuffer(b"".join(films), np.uint8)
+        arrays[f"video/{camera}_bytes"] = np.array([len(film) for film in films])
+    return arrays
+
+
+_ARRAYS = {Stage.SYNTHESIZE: _base, Stage.SCENE: _scene, Stage.RENDER: _views, Stage.EPISODE: _episodes}

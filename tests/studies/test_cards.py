@@ -54,7 +54,7 @@ OBJECTS = ("block", "mug")
 NAME = "kitchen"
 #: Of this joint of this hand the card must say that it never moves.
 STILL_HAND, STILL_JOINT = "barrett", "finger_1_spread"
-SECONDS = {Stage.SYNTHESIZE: 2.0, Stage.SCENE: 0.5, Stage.RENDER: 1.5}
+SECONDS = {Stage.SYNTHESIZE: 2.0, Stage.SCENE: 0.5, Stage.RENDER: 1.5, Stage.EPISODE: 3.0}
 Array = NDArray[Any]
 CHECK = ("sha256sum", "-c", "--strict", "checksums.sha256")
 MANY = [f"object-{number:03}" for number in range(200)]
@@ -162,7 +162,8 @@ def _finish(services, record: JobRecord, change: Any) -> None:
             columns["grasp/rejection"] = (1 - columns["grasp/valid"]).astype(np.uint8)
             output = Output(columns, place or {"base_shard": task.inputs[0]})
         else:
-            output = Output(factories._views(rng, task.count, request), {"scene_shard": task.inputs[0], **place})
+            made_from = {"base_shard" if task.stage is Stage.EPISODE else "scene_shard": task.inputs[0]}
+            output = Output(factories._ARRAYS[task.stage](rng, task.count, request), made_from | place)
         message = create_task_message(record, task, attempt=1, max_attempt=3)
         manifest, data = build_shard(message, output, device="cpu", seconds=SECONDS[task.stage], worker="w1")
         publish_shard(services.store, manifest, data)
@@ -258,12 +259,13 @@ def test_a_cell_that_failed_is_told_with_its_reason(tmp_path: Path) -> None:
 
 
 def test_the_card_of_a_dataset_says_where_its_grasps_are_valid(tmp_path: Path) -> None:
-    made = closed(tmp_path, scene="bin", neighbours=("mug",), views=0)
+    made = closed(tmp_path, scene="bin", neighbours=("mug",), views=0, episodes="flying")
     assert (made.card["making"]["scenes"], made.card["making"]["neighbours"]) == (["bin"], ["mug"])
     assert made.card["validity"]["lift_hard"]["share"] == pytest.approx(0.5, abs=0.02)
     assert "valid grasps in scenes (bin with neighbours mug) of 2 robot hands" in made.page
     assert "| validation | MuJoCo, lift out of the scene |" in made.page
-    assert "At half friction 50 % of them are also lifted." in made.page
+    assert "At half friction 50 % of them are also lifted. Of their episodes, " in made.page
+    assert made.card["validity"]["episodes"]["share"] == pytest.approx(0.8, abs=0.05), "every fifth is out of reach"
     # What is said of free grasps is not said of these.
     assert "planned around a free object" not in made.page and "clearance of the table (no scenes)" not in made.page
 

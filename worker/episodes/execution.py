@@ -104,7 +104,7 @@ def build_executions(
     placed_parts = (Posture(compose(at, part.hand_pose), part.joint_positions) for part in parts)
     postures = dict(zip(POSTURES, placed_parts, strict=True))
     whole = Executions(hand, obj, tool, frame, np.asarray(rows, np.intp), at, postures, placed, dict(quality))
-    if not free.any():
+    if len(grasps) and not free.any():
         raise InputError(f"none of {len(grasps)} grasps has a free straight approach of {100 * STANDOFF_M:.0f} cm")
     return whole.take(np.flatnonzero(free))
 

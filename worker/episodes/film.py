@@ -35,7 +35,6 @@ from graspd.worker.engines import backend
 from graspd.worker.episodes.episode import Episode, Robot
 from graspd.worker.episodes.execution import Executions
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
-from graspd.worker.files.provenance import neighbours_of_shard
 from graspd.worker.hands.primitives import hull
 from graspd.worker.objects.mesh_geometry import corner_normals, to_centred_frame
 from graspd.worker.objects.model import ObjectModel
@@ -398,11 +397,11 @@ def film_maker(
     base: Shard, options: FilmOptions, seed: int, run: ExecutionContext = DEFAULT_CONTEXT
 ) -> Callable[[Robot, Executions], Callable[[Episode], Episode]]:
     """Return a function that makes, for one thread, a function that adds films to an episode."""
-    spec, beside = scene_spec_of(base), neighbours_of_shard(base, [])
+    spec = scene_spec_of(base)
 
     def make(robot: Robot, found: Executions) -> Callable[[Episode], Episode]:
         supports = TABLE if spec is None else scene_supports(spec)
-        neighbours = () if beside is None else beside.objects
+        neighbours = () if found.placed is None else tuple(one.obj for one in found.placed.neighbours)
         renderer = EpisodeRenderer(robot, found.obj, supports=supports, neighbours=neighbours, options=options)
 
         def add(episode: Episode) -> Episode:

@@ -1,7 +1,7 @@
 """Episodes of a base shard's grasps, and the HDF5 shard of episodes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Final
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import ConflictError, InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats
+from graspd.service.store import validity
 from graspd.service.store.columns import CAMERAS, SCHEMAS, VIDEOS, Attribute
 from graspd.service.store.shards import Shard
 from graspd.worker.episodes.episode import Episode, EpisodeOutcome, Robot
@@ -54,6 +55,7 @@ class EpisodeOptions:
     fps: float = FPS
     seed: int = 0
     limit: int = 0  # number of valid grasps, from the first; 0: all
+    empty: bool = False  # whether a shard without valid grasps has an empty result
 
 
 def record_episodes(
@@ -75,11 +77,14 @@ def record_episodes(
         raise InputError(
             f"{base.path or 'the shard'} has free grasps; episodes need a scene: graspd synth --scene table"
         )
-    rows = np.flatnonzero(select_grasps(base)[0])[: options.limit or None]
+    valid = validity.valid_mask(base.arrays) if options.empty else select_grasps(base)[0]
+    rows = np.flatnonzero(valid)[: options.limit or None]
     robot = read_robot(hand, options.arm, mount=options.mount, mount_pose=options.mount_pose, base=options.base)
     grasps, tool = GraspSet.from_columns(base.arrays).take(rows), ToolFrame(hand.root_link, IDENTITY_POSE)
     found = build_executions(hand, obj, grasps, rows=rows, placed=placed.take(rows), tool=tool, quality={})
     convex, done = pieces or decompose(obj), Count(len(found), run, "episodes")
+    state, beside = np.zeros((0, len(robot.names))), np.zeros((0, len(placed.neighbours), 7))
+    none = Episode(0, 0, EpisodeOutcome.NO_TRANSIT, np.zeros(0, np.uint8), state, state, neighbour_pose=beside)
 
     def make() -> tuple[MotionPlanner, Simulation, Film | None]:
         planner = MotionPlanner(robot, found, convex, seed=options.seed)
@@ -93,9 +98,7 @@ def record_episodes(
             episode = simulation.execute(motion, shard_row)
             episode = episode if camera is None else camera(episode)
         else:
-            none, beside = np.zeros((0, len(robot.names))), np.zeros((0, len(placed.neighbours), 7))
-            scene, phase = int(placed.index[shard_row]), np.zeros(0, np.uint8)
-            episode = Episode(shard_row, scene, motion, phase, none, none, neighbour_pose=beside)
+            episode = replace(none, row=shard_row, scene=int(placed.index[shard_row]), outcome=motion)
         done.add(1)
         return episode
 
@@ -104,7 +107,7 @@ def record_episodes(
     attributes: dict[str, Attribute] = inherited | source_attributes(base) | _robot_attributes(robot, options)
     attributes |= {"seed": options.seed, "fps": options.fps, "device": "cpu"}
     quality = [path for path in SCHEMAS["episodes"] if path.startswith("quality/") and path in base.arrays]
-    columns = episode_columns(episodes, placed) | {path: np.asarray(base.arrays[path])[rows] for path in quality}
+    columns = episode_columns(episodes, none, placed) | {path: np.asarray(base.arrays[path])[rows] for path in quality}
     return columns, attributes | {"seconds": round(perf_counter() - began, 4)}
 
 
@@ -143,8 +146,8 @@ def robot_of_shard(shard: Shard, hand: HandModel) -> Robot:
     return robot
 
 
-def episode_columns(episodes: list[Episode], placed: PlacedGrasps) -> dict[str, NDArray[Any]]:
-    """Return the columns of a shard of episodes, except those of the grasps' quality."""
+def episode_columns(episodes: list[Episode], none: Episode, placed: PlacedGrasps) -> dict[str, NDArray[Any]]:
+    """Return the columns of a shard of episodes, except those of the grasps' quality; `none` has no frames."""
     columns: dict[str, NDArray[Any]] = {
         "episode/row": np.array([one.row for one in episodes], np.int32),
         "episode/scene_index": np.array([one.scene for one in episodes], np.int32),
@@ -153,7 +156,8 @@ def episode_columns(episodes: list[Episode], placed: PlacedGrasps) -> dict[str, 
         "scene/object_pose": np.asarray(placed.object_pose),
     }
     for name in _FRAMES if placed.neighbours else _FRAMES[:-1]:
-        columns[f"frame/{name}"] = np.concatenate([getattr(one, name) for one in episodes])
+        parts, dtype = [getattr(one, name) for one in (none, *episodes)], SCHEMAS["episodes"][f"frame/{name}"].dtype
+        columns[f"frame/{name}"] = np.concatenate(parts, dtype=dtype, casting="same_kind")
     if placed.neighbours:
         columns["scene/neighbour_pose"] = np.asarray(placed.neighbour_pose)
     for camera in CAMERAS:

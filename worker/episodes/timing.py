@@ -46,10 +46,8 @@ class MotionLimits:
         For accelerations of a rotation this is an upper bound."""
         if not self.flying:
             return np.abs(differences)
-        place, turn = (
-            np.linalg.norm(part, axis=1, keepdims=True) for part in np.split(differences[:, :7], [3], axis=1)
-        )
-        return np.concatenate([place, 2 * turn, np.abs(differences[:, 7:])], axis=1)
+        place, turn = (np.linalg.norm(part, axis=1) for part in (differences[:, :3], 2 * differences[:, 3:7]))
+        return np.column_stack([place, turn, np.abs(differences[:, 7:])])
 
     def continuous(self, states: Floats) -> Floats:
         """Return states (M, D) whose quaternions have no change of sign between neighbours."""

@@ -1,6 +1,7 @@
 """Subsets of a dataset as their own base shards, and the selection of grasps by a command."""
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from itertools import groupby
 from pathlib import Path, PurePosixPath
@@ -11,6 +12,7 @@ import typer
 from numpy.typing import NDArray
 
 from graspd.service.cli import load_settings
+from graspd.service.model.base import DIGEST
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.readers import Shards, open_shards
 from graspd.service.store import validity
@@ -22,7 +24,7 @@ Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
 
 
 def open_source(source: str) -> Shards:
-    """Return the shards of a file or folder, or of a dataset in this machine's store by name.
+    """Return the shards of a file or folder, or of a dataset by name or a job by id in this machine's store.
     Raises NotFoundError: none of these exists."""
     if "/" in source or source in (".", "..") or Path(source).exists():
         return open_shards(Path(source))
@@ -30,7 +32,8 @@ def open_source(source: str) -> Shards:
         store = open_store(load_settings().resolved_store_url, make=False)
     except NotFoundError as error:
         raise NotFoundError(f"{source} is no file or folder, and {error}") from None
-    return open_shards(store, dataset=source)
+    is_job = re.fullmatch(DIGEST, source) is not None
+    return open_shards(store, job=source) if is_job else open_shards(store, dataset=source)
 
 
 def require_empty_folder(folder: Path) -> None:

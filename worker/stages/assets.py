@@ -3,13 +3,16 @@ The first worker that needs an object repairs and simplifies it, and stores the 
 
 import threading
 import zipfile
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from cachetools import LRUCache
+from numpy.typing import NDArray
 
 from graspd.service.model import names
 from graspd.service.model.contact_region import parse_region
@@ -37,6 +40,9 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.options import apply_request
 from graspd.worker.objects.prepare import load_object
 from graspd.worker.planners.network_cache import store_network
+from graspd.worker.scenes.kinds import supports_of
+from graspd.worker.scenes.placement import neighbour_of
+from graspd.worker.simulation.environment import Scenes
 from graspd.worker.stages.context import TaskContext
 from graspd.worker.stages.models import SHOWN_ERROR_M, publish_model
 from graspd.worker.validation.decomposition import ConvexPieces, decompose, piece_file
@@ -90,6 +96,15 @@ def neighbours_of(store: Store, message: TaskMessage | ShardManifest) -> list[Ob
 
     beside = [(one.object, one.digest or "") for one in message.request.all_neighbours]
     return [_cached((store.url, "neighbour", *key), partial(load, *key)) for key in beside]
+
+
+def scenes_of(store: Store, message: TaskMessage | ShardManifest, columns: Mapping[str, NDArray[np.generic]]) -> Scenes:
+    """Return the scenes in which the grasps of a task are planned, by the columns of a shard."""
+    scenes = Scenes(supports_of(message.request.scene_spec), np.asarray(columns["scene/object_pose"], float))
+    if beside := tuple(neighbour_of(other) for other in neighbours_of(store, message)):
+        at = np.asarray(columns["scene/neighbour_pose"], float)
+        scenes = replace(scenes, neighbours=beside, neighbour_pose=at)
+    return scenes
 
 
 def cache_network(store: Store, message: TaskMessage) -> None:

@@ -103,7 +103,8 @@ def object_glb(obj: ObjectModel) -> bytes:
     """Return the prepared mesh as glTF [m]; its node is translated to the middle, for 32-bit coordinates."""
     document = Document()
     primitive = document.add_triangles(obj.centred.vertices, obj.faces, obj.corner_normals)
-    extras = {"kind": "object", "name": obj.name, "centre_of_mass": rounded_values(obj.centre_of_mass)}
+    extras: dict[str, Any] = {"kind": "object", "name": obj.name, "centre_of_mass": rounded_values(obj.centre_of_mass)}
+    extras |= {"extents_m": rounded_values(np.ptp(obj.vertices, axis=0)), "mass_kg": obj.mass}
     node = {"name": obj.name, "mesh": document.add_mesh([primitive]), "translation": list(obj.centre)}
     return document.to_bytes([node], extras)
 

@@ -5,7 +5,6 @@ that of the validator at nominal friction, in the frame of the object at rest.""
 
 import json
 import sys
-from dataclasses import replace
 from typing import Any, Final
 
 import mujoco
@@ -17,9 +16,6 @@ from graspd.service.readers.trajectories import slider_positions, trajectory_of
 from graspd.service.store.manifests import load_manifest, load_shard
 from graspd.service.store.store import Store, open_store
 from graspd.worker.grasps import GraspSet
-from graspd.worker.scenes.kinds import supports_of
-from graspd.worker.scenes.placement import neighbour_of
-from graspd.worker.simulation.environment import Scenes
 from graspd.worker.stages import assets
 from graspd.worker.validation.lift import Lift, LiftOutcome
 from graspd.worker.validation.model import MujocoOptions, scene_of
@@ -101,10 +97,7 @@ def replay(store: Store, shard_id: str, row: int) -> dict[str, Any]:
         rollout = test.dexgraspbench(grasps, 0) if published else test.standard(grasps, 0)
         outcome = next((one for one in rollout.outcomes if one > Outcome.HELD), Outcome.HELD)
     else:
-        scenes = Scenes(supports_of(manifest.request.scene_spec), np.asarray(shard["scene/object_pose"], float))
-        if beside := tuple(neighbour_of(other) for other in assets.neighbours_of(store, manifest)):
-            scenes = replace(scenes, neighbours=beside, neighbour_pose=np.asarray(shard["scene/neighbour_pose"]))
-        placed = scenes.placed(grasps.scene)
+        placed = assets.scenes_of(store, manifest, shard.arrays).placed(grasps.scene)
         test = lift = _LiftRecorder(
             scene_of(hand, obj, pieces, MujocoOptions(), placed.supports, placed.neighbours), placed
         )

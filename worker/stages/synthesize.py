@@ -19,9 +19,6 @@ from graspd.worker.batched_generation import validated_batches
 from graspd.worker.files.provenance import base_attributes
 from graspd.worker.generation import ValidatedBatch
 from graspd.worker.planners import NoStartFound, planner
-from graspd.worker.scenes.kinds import supports_of
-from graspd.worker.scenes.placement import neighbour_of
-from graspd.worker.simulation.environment import Scenes
 from graspd.worker.stages import assets
 from graspd.worker.stages.context import Output, TaskContext
 from graspd.worker.stages.ranges import join_outputs, sizes_of
@@ -37,7 +34,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     hand, obj = assets.hand_of(context.store, message), assets.object_of(context.store, message)
     assets.cache_network(context.store, message)
     columns = _scene_columns(message, context)
-    scenes = [_build_scenes(message, part, context) for part in columns]
+    scenes = [assets.scenes_of(context.store, message, part) for part in columns]
     context.check()
     try:
         found = validated_batches(
@@ -96,14 +93,6 @@ def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str,
     count = len(sizes_of(message))
     parts = {name: np.split(column, count) for name, column in there.items()}
     return [{name: column[number] for name, column in parts.items()} for number in range(count)]
-
-
-def _build_scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: TaskContext) -> Scenes:
-    scenes = Scenes(supports_of(message.request.scene_spec), columns["scene/object_pose"])
-    if not (others := assets.neighbours_of(context.store, message)):
-        return scenes
-    beside = tuple(neighbour_of(other) for other in others)
-    return replace(scenes, neighbours=beside, neighbour_pose=columns["scene/neighbour_pose"])
 
 
 def _stop_if_empty(message: TaskMessage, batch: int, found: ValidatedBatch, *, in_scenes: bool) -> None:

@@ -1,12 +1,12 @@
 """Queries of jobs, tasks, attempts and shards, and the outcomes of a job's candidates."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Final, Literal, Unpack
 
-from sqlalchemy import Column, ColumnElement, Connection, Float, case, cast, func, literal_column, select
+from sqlalchemy import Column, ColumnElement, Connection, Float, and_, case, cast, func, literal_column, select
 
 from graspd.service.index import database
 from graspd.service.index.tables import attempts, dataset_cells, jobs, shards, tasks
@@ -14,6 +14,7 @@ from graspd.service.index.views import AttemptView, JobView, Page, ShardView, St
 from graspd.service.model.planning import count_ranges, phase_seconds, sum_outcomes
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.states import Stage, State
+from graspd.service.store.columns import ShardKind
 
 #: Finished share of a task.
 SHARE_DONE: Final[ColumnElement[float]] = case(
@@ -75,6 +76,9 @@ class Jobs(database.IndexPart):
             found = {"outcomes": _sum_infos(infos), "phases": phase_seconds(*infos), "seconds_by_device": seconds}
             if view.request.second_engines:
                 found |= sum_outcomes(info.get("second_engine") or {} for info in infos)
+            if view.request.has_episodes:
+                made = _parts_of_manifests(connection, own, "episodes", Stage.EPISODE)
+                found["episodes"] = dict(Counter(outcome for part in made for outcome in part.values()))
             return view.model_copy(update=found)
 
     def unfinished(self, ids: Collection[str]) -> set[str]:
@@ -181,9 +185,15 @@ def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[st
 
 
 def _infos_of(connection: Connection, of_jobs: ColumnElement[bool]) -> list[dict[str, Any]]:
-    query = select(shards.c.manifest["info"]).join(tasks, tasks.c.shard_id == shards.c.id)
-    query = query.where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value).limit(MOST_SHARDS)
-    return [info for info in connection.scalars(query) if isinstance(info, dict)]
+    return _parts_of_manifests(connection, of_jobs, "info", Stage.SYNTHESIZE)
+
+
+def _parts_of_manifests(
+    connection: Connection, of_jobs: ColumnElement[bool], name: str, stage: Stage
+) -> list[dict[str, Any]]:
+    query = select(shards.c.manifest[name]).join(tasks, tasks.c.shard_id == shards.c.id)
+    query = query.where(of_jobs, tasks.c.stage == stage.value).limit(MOST_SHARDS)
+    return [part for part in connection.scalars(query) if isinstance(part, dict)]
 
 
 def _sum_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, int]:
@@ -195,7 +205,7 @@ class Shards(database.IndexPart):
         self,
         *,
         job: str | None = None,
-        kind: Literal["base", "scene", "views"] | None = None,
+        kind: ShardKind | None = None,
         scope: ProjectScope = EVERYTHING,
         **part: Unpack[database.Paging],
     ) -> Page[ShardView]:
@@ -219,6 +229,15 @@ class Shards(database.IndexPart):
         query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *in_scope)
         found: str | None = self.database.value(query.limit(1))
         return found
+
+    def episodes_of(self, base: str, *, scope: ProjectScope = EVERYTHING) -> list[ShardView]:
+        """Return the shards of episodes of a base shard's grasps, newest first."""
+        own = tasks.alias()
+        same = (own.c.job_id == tasks.c.job_id, own.c.batch == tasks.c.batch, own.c.shard_id == base)
+        query = select(shards).join(tasks, tasks.c.shard_id == shards.c.id).join(own, and_(*same))
+        query = query.where(tasks.c.stage == Stage.EPISODE.value, *database.scope_conditions_by_job(scope, tasks))
+        rows = self.database.rows(query.order_by(shards.c.created.desc(), shards.c.id))
+        return list({row["id"]: ShardView(**row) for row in rows}.values())
 
     def get(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> ShardView:
         query = select(shards).where(shards.c.id == shard_id, *database.shard_scope_conditions(scope, shards.c.id))

@@ -6,7 +6,7 @@ seconds) scales all stored values. A rate's interval is the scatter of batches, 
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Hashable, Iterable
+from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median, quantiles
 from typing import Final
@@ -54,7 +54,7 @@ class Machine:
 
 @dataclass(frozen=True)
 class StageRate:
-    """Cost of a scene (per batch and scene) or a picture (per million pixels)."""
+    """Cost of a scene (per batch and scene), a picture (per million pixels) or an episode."""
 
     seconds: float
     size_bytes: float
@@ -87,6 +87,9 @@ STORED_IN_SCENE: Final = (1.6, 0.5)
 #: Seconds per valid grasp and perturbed model on two cores (docs/results/robust.md); few tests end early.
 STORED_MODEL_S: Final = 0.018
 STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
+#: Seconds and bytes of an episode, and of its film by one camera at 320 x 240.
+STORED_EPISODE: Final = (1.0, 16e3)
+STORED_FILM: Final = (2.5, 170e3)
 
 
 class Rates:
@@ -211,31 +214,39 @@ def cost_options(options: JobOptions) -> Hashable:
     )
 
 
-def _rate_on_machine(machine: Machine, stored: StageRate) -> StageRate:
-    seconds = stored.seconds * machine.factor
-    return replace(stored, seconds=seconds, origin=machine.scaled_origin(stored.origin), spread=machine.stored_spread)
-
-
 def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
     """Return seconds per batch and scene, and bytes per grasp and scene (per scene if planned in scenes)."""
     found = [batch for batch in batches if batch.request.scenes and batch.request.in_scene == options.in_scene]
-    rows = sum(batch.count for batch in found)
-    if not rows:
-        return _rate_on_machine(machine, STORED_PLACE if options.in_scene else STORED_SCENE)
-    scenes = sum(batch.batches * batch.request.scenes for batch in found)
-    seconds = sum(batch.seconds for batch in found) / scenes
-    spread = _relative_deciles([one.seconds / (one.batches * one.request.scenes) for one in found], MEASURED_SPREAD)
-    return StageRate(seconds, sum(b.size_bytes for b in found) / rows, "measured here", len(found), spread)
+    scenes = [batch.batches * batch.request.scenes for batch in found]
+    stored = STORED_PLACE if options.in_scene else STORED_SCENE
+    return _stage_rate(found, scenes, [batch.count for batch in found], stored, machine)
 
 
 def picture_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
     """Return seconds and bytes per million pixels, if possible of pictures with the same channels."""
     found = [batch for batch in batches if batch.count]
     found = [batch for batch in found if batch.request.channels == options.channels] or found
-    pixels = [batch.count * batch.request.width * batch.request.height for batch in found]
-    if not (megapixels := sum(pixels) / 1e6):
-        return _rate_on_machine(machine, STORED_PICTURE)
-    seconds = sum(batch.seconds for batch in found) / megapixels
-    each = [batch.seconds / number for batch, number in zip(found, pixels, strict=True)]
-    sizes = sum(batch.size_bytes for batch in found) / megapixels
-    return StageRate(seconds, sizes, "measured here", len(found), _relative_deciles(each, MEASURED_SPREAD))
+    megapixels = [batch.count * batch.request.width * batch.request.height / 1e6 for batch in found]
+    return _stage_rate(found, megapixels, megapixels, STORED_PICTURE, machine)
+
+
+def episode_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
+    """Return seconds and bytes per episode of the same robot and cameras."""
+    like = (options.episodes, options.film)
+    found = [one for one in batches if one.count and (one.request.episodes, one.request.film) == like]
+    counts = [batch.count for batch in found]
+    seconds, size = (whole + len(options.film) * film for whole, film in zip(STORED_EPISODE, STORED_FILM, strict=True))
+    return _stage_rate(found, counts, counts, StageRate(seconds, size, ORIGIN, 0), machine)
+
+
+def _stage_rate(
+    batches: list[BatchCost], units: Sequence[float], rows: Sequence[float], stored: StageRate, machine: Machine
+) -> StageRate:
+    """Return seconds per unit of work and bytes per row of the batches; without rows, the stored rate."""
+    if not sum(rows):
+        seconds, origin = stored.seconds * machine.factor, machine.scaled_origin(stored.origin)
+        return replace(stored, seconds=seconds, origin=origin, spread=machine.stored_spread)
+    seconds = sum(batch.seconds for batch in batches) / sum(units)
+    each = [batch.seconds / number for batch, number in zip(batches, units, strict=True)]
+    size = sum(batch.size_bytes for batch in batches) / sum(rows)
+    return StageRate(seconds, size, "measured here", len(batches), _relative_deciles(each, MEASURED_SPREAD))

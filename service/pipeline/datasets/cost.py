@@ -2,7 +2,7 @@
 
     candidates of a cell = grasps / yield, at most grasps x budget   (want candidates: grasps)
     seconds of a cell  = candidates x seconds per candidate + batches x scenes x seconds per scene
-                         + pictures x seconds per picture
+                         + pictures x seconds per picture + valid grasps x seconds per episode
     time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
 
 `service.index.queries.rates` provides rates and intervals. Intervals add, as if all errors were correlated. Workers are
@@ -11,7 +11,7 @@ assumed to run on devices like the measured ones.
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
@@ -23,12 +23,14 @@ from graspd.service.index.queries.rates import (
     Rate,
     Rates,
     StageRate,
+    episode_rate,
     expected_candidates,
     picture_rate,
     scene_rate,
 )
 from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest
 from graspd.service.model.errors import LimitError
+from graspd.service.model.names import SHARD_KINDS
 from graspd.service.model.planning import stages_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import create_job_request
@@ -42,6 +44,7 @@ _MESSAGE_BYTES: Final = 19_500
 _ASSET_BYTES: Final = 250_000
 _SHOWN_RATES: Final = 20
 Batches = Callable[[Stage], list[BatchCost]]
+_RATES: Final = {Stage.SCENE: scene_rate, Stage.RENDER: picture_rate, Stage.EPISODE: episode_rate}
 
 
 @dataclass
@@ -84,11 +87,11 @@ def estimate(
                 rates[chosen.resolved_fidelity.name] = Rates(batches, chosen, devices)
             sums.machine = rates[chosen.resolved_fidelity.name].machine
             _add_cell(sums, hand, rates[chosen.resolved_fidelity.name].rate_for(hand, obj), options)
-    scene = scene_rate(costs(Stage.SCENE) if options.scenes else [], options, sums.machine)
-    picture = picture_rate(costs(Stage.RENDER) if options.views else [], options, sums.machine)
+    stages = stages_of(options)
+    later = {stage: rate(costs(stage), options, sums.machine) for stage, rate in _RATES.items() if stage in stages}
     with_neighbours = list(dict.fromkeys([*objects, *(one.object for one in options.all_neighbours)]))
     known = _asset_bytes(index, matrix.hands, with_neighbours, scope)
-    return _estimate_from_sums(options, len(matrix.hands) * len(objects), sums, (scene, picture), known)
+    return _estimate_from_sums(options, len(matrix.hands) * len(objects), sums, later, known)
 
 
 def expand_objects(index: Index, matrix: Matrix, scope: ProjectScope) -> list[str]:
@@ -117,23 +120,23 @@ def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:
 
 
 def _estimate_from_sums(
-    options: JobOptions, cells: int, sums: _Sums, later: tuple[StageRate, StageRate], known: tuple[float, list[str]]
+    options: JobOptions, cells: int, sums: _Sums, later: Mapping[Stage, StageRate], known: tuple[float, list[str]]
 ) -> Estimate:
     batches, stages = cells * -(-options.grasps // BATCH_SIZE), stages_of(options)
-    (scene, picture), (assets, unknown) = later, known
+    assets, unknown = known
     pictures = options.scenes * options.views * (2 if options.stereo else 1)
     pixels = batches * pictures * options.width * options.height / 1e6
     seconds = {Stage.SYNTHESIZE: sums.seconds}
     ends = {Stage.SYNTHESIZE: (sums.low, sums.high)}
     storage = {"base": sums.base_bytes}
-    if Stage.SCENE in stages:
-        seconds[Stage.SCENE] = batches * options.scenes * scene.seconds
-        ends[Stage.SCENE] = _bounds(seconds[Stage.SCENE], scene)
-        storage["scene"] = (batches if options.in_scene else sums.kept) * options.scenes * scene.size_bytes
-    if Stage.RENDER in stages:
-        seconds[Stage.RENDER] = pixels * picture.seconds
-        ends[Stage.RENDER] = _bounds(seconds[Stage.RENDER], picture)
-        storage["views"] = pixels * picture.size_bytes
+    scenes, placed = batches * options.scenes, (batches if options.in_scene else sums.kept) * options.scenes
+    works = {Stage.SCENE: (scenes, placed), Stage.RENDER: (pixels, pixels), Stage.EPISODE: (sums.valid, sums.valid)}
+    for stage, (units, rows) in works.items():
+        if stage in stages:
+            rate = later[stage]
+            seconds[stage] = units * rate.seconds
+            ends[stage] = (seconds[stage] * rate.spread[0], seconds[stage] * rate.spread[1])
+            storage[SHARD_KINDS[stage]] = rows * rate.size_bytes
     total = sum(seconds.values())
     low, high = (sum(found) for found in zip(*ends.values(), strict=True))
     read = sum(storage[kind] for kind in list(storage)[:-1])
@@ -158,10 +161,6 @@ def _estimate_from_sums(
         measured_share=sum(n for (_, rate), n in sums.cells.items() if rate.batches) / cells,
         unknown=unknown,
     )
-
-
-def _bounds(seconds: float, rate: StageRate) -> tuple[float, float]:
-    return seconds * rate.spread[0], seconds * rate.spread[1]
 
 
 def _plan(

@@ -109,7 +109,13 @@ _URDF = b"""<robot name="two"><link name="base"/><link name="tip"/><joint name="
 #: For each parameter of a path: what of the project it may name.
 _VALUES: dict[str, tuple[str, ...]] = (
     {"job_id": ("job_id", "failed", "waiting"), "shard_id": ("shard_id", "views"), "kind": ("object", "hand")}
-    | {"digest": ("digest", "objects_digest"), "row": ("0",), "index": ("0",), "slug": ("not-found",)}
+    | {
+        "digest": ("digest", "objects_digest"),
+        "row": ("0",),
+        "camera": ("scene",),
+        "index": ("0",),
+        "slug": ("not-found",),
+    }
     | {
         "webhook_id": ("webhook",),
         "task_id": ("task_id",),

@@ -166,6 +166,8 @@ def test_hands_and_objects_name_their_datasets_and_licence(http: TestClient, ser
         assert page.count("data-model=") == page.count("Apache-2.0") == 3
         assert page.count('href="/datasets/kitchen"') == 1 == 3 - others
     assert "<dt>Joints</dt><dd>16</dd>" in http.get("/hands").text
+    for words in ("<dt>Size</dt><dd>60 × 45 × 90 mm</dd>", "<dt>Mass</dt><dd>0.156 kg</dd>"):
+        assert words in http.get("/objects/block").text and words in http.get("/objects").text, "without a check"
     assert 'href="/datasets/kitchen"' in http.get("/objects/mug").text
     assert 'href="/datasets/kitchen"' not in http.get("/objects/block").text
     assert 'href="/datasets/kitchen"' in http.get("/hands/allegro").text

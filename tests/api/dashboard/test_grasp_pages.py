@@ -15,10 +15,11 @@ from graspd.api.catalog import grasps
 from graspd.api.catalog.grasps import validated_by
 from graspd.service import user_cache
 from graspd.service.model.metrics import AXIS_MEANINGS, PerturbedParameter
+from graspd.service.model.planning import plan_tasks
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.shards import Shard, read_shard
 from graspd.worker.validation.protocol import ValidatedBy
-from tests.api.factories import JOINTS, add_job, finish_all
+from tests.api.factories import JOINTS, add_job, finish, finish_all
 
 
 def test_a_grasp_is_the_row_of_its_shard(http: TestClient, services: Services) -> None:
@@ -29,6 +30,35 @@ def test_a_grasp_is_the_row_of_its_shard(http: TestClient, services: Services) -
     np.testing.assert_allclose(document["sweep"]["epsilon"], shard["quality/epsilon"][5])
     assert len(document["joint_names"]) == len(document["postures"]["grasp"]["joint_positions"]) == JOINTS
     assert document["hand_digest"] == manifest.hand_digest
+
+
+def test_episodes_are_counted_and_shown_with_their_films(http: TestClient, services: Services) -> None:
+    plain = {"scene": "table", "scenes": 1}
+    flying = add_job(services, **plain, episodes="flying", film=["scene", "wrist"])
+    _, base, made = finish_all(services, flying)
+    arm = add_job(services, **plain, episodes="ur10e")
+    finish(services, arm, list(plan_tasks(arm))[-1])
+    assert (made.count, made.valid) == (31, 25), "the first grasp has none, and six others are out of reach"
+    assert http.get(f"/v1/jobs/{flying.id}").json()["episodes"] == {"succeeded": 25, "out of reach": 6}
+    assert "25 of 31 grasps executed, 25 succeeded" in http.get(f"/jobs/{flying.id}").text
+    found = {
+        row: [(one["robot"], one["outcome"], one["films"]) for one in http.get(f"{of}/episodes").json()]
+        for row in (0, 3, 5)
+        for of in (f"/v1/grasps/{base.shard_id}/{row}",)
+    }
+    films = {camera: f"/v1/shards/{made.shard_id}/films/3/{camera}" for camera in ("scene", "wrist")}
+    assert found[0] == []
+    assert sorted(found[3], key=str) == [("flying", "succeeded", films), ("ur10e", "succeeded", {})]
+    assert ("flying", "out of reach", {}) in found[5]
+    page = http.get(f"/grasps/{base.shard_id}/3").text
+    assert all(f'<video controls preload="metadata" src="{film}"' in page for film in films.values())
+    for camera, film in films.items():
+        answer = http.get(film)
+        assert (answer.headers["content-type"], answer.content) == ("video/mp4", f"{camera} 3".encode())
+    for absent in (films["scene"].replace("/3/", "/5/"), films["scene"].replace("/3/", "/0/"), films["scene"] + "s"):
+        assert http.get(absent).status_code == 404
+    assert "media-src 'self'" in answer.headers["content-security-policy"]
+    assert http.get(f"/jobs/{arm.id}").text.count("<video") == 0
 
 
 def test_an_absent_grasp_is_named_and_a_lost_file_an_error(http: TestClient, services: Services) -> None:

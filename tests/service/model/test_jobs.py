@@ -30,7 +30,7 @@ from graspd.service.model.planning import (
 from graspd.service.model.records import DatasetMember, DatasetRecord, JobRecord
 from graspd.service.model.renamed import original_request
 from graspd.service.model.states import Priority, Stage, State
-from graspd.service.model.version import STAGE_REVISIONS
+from graspd.service.model.version import STAGE_REVISIONS, TASK_SCHEMA
 from graspd.service.pipeline.datasets.spec import create_record
 from graspd.worker.planners.registry import PLANNERS, method
 from tests.fakes import job_record, request
@@ -119,7 +119,8 @@ def test_a_job_without_a_scene_keeps_its_id_and_its_record() -> None:
     wanted = {**PLAIN, "hand": "gripper", "object": "ball"}
     job = record(request())
     assert job.request.model_dump(mode="json") == wanted
-    said = {"request": original_request(wanted), "hand": HAND, "object": OBJECT, "revisions": STAGE_REVISIONS}
+    revisions = {stage: revision for stage, revision in STAGE_REVISIONS.items() if stage != "episode"}
+    said = {"request": original_request(wanted), "hand": HAND, "object": OBJECT, "revisions": revisions}
     assert job.id == digest_json(said)
     (task,) = plan_tasks(job)
     assert create_task_message(job, task, attempt=1, max_attempt=3).model_dump(mode="json")["request"] == wanted
@@ -156,6 +157,21 @@ def test_a_job_in_a_scene_makes_its_scenes_first() -> None:
     scene, base, views = plan_tasks(job)
     assert [task.stage for task in (scene, base, views)] == [Stage.SCENE, Stage.SYNTHESIZE, Stage.RENDER]
     assert (scene.inputs, base.inputs, views.inputs) == ((), (scene.output,), (base.output,))
+
+
+def test_episodes_come_last_read_the_grasps_and_move_no_other_shard() -> None:
+    plain = {"scene": "table", "views": 2}
+    *others, episodes = plan_tasks(record(request(**plain, episodes="flying")))
+    assert [task.output for task in others] == [task.output for task in plan_tasks(record(request(**plain)))]
+    assert (episodes.stage, episodes.inputs) == (Stage.EPISODE, (others[1].output,))
+    more = [{"episodes": "ur10e"}, {"film": ["wrist"]}, {"film": ["wrist", "scene"]}, {"episode_fps": 30}]
+    made = [list(plan_tasks(record(request(**{"scene": "table", "episodes": "flying"} | one))))[-1] for one in more]
+    assert len({episodes.output, *(task.output for task in made)}) == 1 + len(more)
+    assert (
+        planning.required_schema(request(**plain, episodes="flying"))
+        == TASK_SCHEMA
+        > planning.required_schema(request(**plain))
+    )
 
 
 @pytest.mark.parametrize(
@@ -196,6 +212,10 @@ def test_a_document_comes_back_and_fingertips_may_touch_unless_it_says_otherwise
         ({"scene": {"supports": [PLANE], "file": "/etc/passwd"}}, "Extra inputs"),
         ({"scene": {"supports": [PLANE], "target": [0, 0, 0, 1, 0, 0, 0]}, "faces": "all"}, "lies on one face"),
         ({"faces": "all"}, "lies on no face"),
+        ({"episodes": "flying"}, "free grasps have no episodes"),
+        ({"scene": "table", "episodes": "flying", "validation": "none"}, "episodes execute valid grasps"),
+        ({"scene": "table", "film": ["scene"]}, "film shows episodes"),
+        ({"scene": "table", "episodes": "flying", "film": ["scene"], "width": 321}, "choose even numbers"),
         ({"touch": 1}, "no supports to touch"),
         ({"scene": "table", "touch": -1.5}, "greater than or equal to -1"),
         ({"scene": "table", "touch": NAN}, "finite number"),

@@ -56,7 +56,7 @@ PHYSX = replace(NEED, engines=("physx",))
         ([beat()], NEED, Route()),
         ([beat(), beat(stage=Stage.SCENE, revision=1)], NEED, Route()),
         ([beat(), NEXT], NEED, Route(apart=True)),
-        ([beat(), beat(schemas=(9, 9))], NEED, Route(apart=True)),
+        ([beat(), beat(schemas=(OWN.schemas[1] + 1,) * 2)], NEED, Route(apart=True)),
         ([beat(schemas=(2, 9)), beat(schemas=(2, 2))], replace(NEED, schema=3, newest=9), Route(apart=True)),
         ([beat(schemas=(4, 9))], replace(NEED, schema=2, newest=5), Route()),
         ([beat(engines=("physx",)), beat(engines=("drake", "physx"))], PHYSX, Route()),
@@ -103,8 +103,9 @@ def test_a_worker_that_does_not_say_what_it_can_is_given_no_task() -> None:
 def test_a_worker_looks_apart_only_for_what_it_can_do() -> None:
     names = queue_names([Stage.SYNTHESIZE], ability=OWN)
     apart = [f"interactive-synthesize.{schema}.{REVISION}" for schema in range(FIRST_SCHEMA, OWN.schemas[1] + 1)]
-    # Only messages of the newest schema name engines.
-    assert names[: len(apart) + 2] == [*apart, f"{apart[-1]}.drake", "interactive-synthesize"]
+    # Only messages since the schema of engines name them.
+    engines = [apart[-2], f"{apart[-2]}.drake", apart[-1], f"{apart[-1]}.drake"]
+    assert names[: len(apart) + 3] == [*apart[:-2], *engines, "interactive-synthesize"]
 
 
 def test_tasks_that_wait_apart_are_seen_and_leave(rq_queue: RqQueue) -> None:
@@ -120,16 +121,16 @@ def test_tasks_that_wait_apart_are_seen_and_leave(rq_queue: RqQueue) -> None:
     assert rq_queue.waiting_tasks() == {message.task_id}
     rq_queue.remove_unserved_lists([beat(), NEXT])
     assert rq_queue.waiting_tasks() == set()
-    assert list_names(rq_queue.connection) == list_names(rq_queue.connection)[:8]
+    assert list_names(rq_queue.connection) == list_names(rq_queue.connection)[: 2 * len(Stage)]
     assert rq_queue.enqueue([message], Priority.BULK) == 1, "nothing of it is left"
 
 
 def test_forged_names_of_lists_are_nobodys(rq_queue: RqQueue) -> None:
     forged = [f"rq:queue:bulk-synthesize.{n}.1" for n in range(200)]
     rq_queue.connection.sadd("rq:queues", "rq:queue:other.2.10", "rq:queue:bulk-synthesize.x.1", b"\xff", *forged)
-    assert len(list_names(rq_queue.connection)) == 8 + 64
+    assert len(list_names(rq_queue.connection)) == 2 * len(Stage) + 64
     rq_queue.connection.set("rq:queues", "no set")
-    assert len(list_names(rq_queue.connection)) == 8
+    assert len(list_names(rq_queue.connection)) == 2 * len(Stage)
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.simulation.environment import Environment, Obstacle, Scenes
+from graspd.worker.simulation.environment import Environment, Neighbour, Obstacle, Scenes
 from graspd.worker.simulation.obstacles import obstacle_clearance
 from graspd.worker.validation.decomposition import decompose
 from tests.worker.models import object_from_mesh, two_finger_hand
@@ -57,8 +57,9 @@ def shift(x: float, z: float) -> np.ndarray:
     return made
 
 
-def executions(supports: tuple[Obstacle, ...] = (TABLE,), count: int = 4) -> Executions:
-    """Grasps of a cube on a table from above, each at another place and turned by another angle."""
+def executions(supports: tuple[Obstacle, ...] = (TABLE,), count: int = 4, beside: Obstacle | None = None) -> Executions:
+    """Grasps of a cube on a table from above, each in its own scene: another place, and turned by another angle.
+    The neighbour `beside` stands in the scene of the second grasp, and below the tables in others."""
     places = np.array([(0.1 * np.cos(k), 0.15 * np.sin(2 * k), 0.02) for k in range(count)])
     object_pose = np.concatenate([places, np.tile([1.0, 0, 0, 0], (count, 1))], axis=1)
     yaw = quat_from_axis_angle(np.tile([0, 0, 1.0], (count, 1)), np.linspace(-1.5, 1.5, count))
@@ -67,7 +68,12 @@ def executions(supports: tuple[Obstacle, ...] = (TABLE,), count: int = 4) -> Exe
     high = np.array([0, 0, 0.1, 0, 0, 0, 0])
     postures = [Posture(down + high, wide), Posture(down, wide), Posture(down, 0 * wide), Posture(down, closed)]
     postures += [Posture(down, closed + 0.1), Posture(down + high, closed + 0.1)]
-    placed = Scenes(supports, object_pose).placed(np.arange(count))
+    scenes = Scenes(supports, object_pose)
+    if beside is not None:
+        poses = np.tile([0, 0, -9.0, 1, 0, 0, 0], (count, 1, 1))
+        poses[1, 0, :3] = middle = beside.corners.mean(axis=0)
+        scenes = Scenes(supports, object_pose, (Neighbour(CUBE, (beside.corners - middle,), (), 0.0),), poses)
+    placed = scenes.placed(np.arange(count))
     named = dict(zip(POSTURES, postures, strict=True))
     return Executions(
         HAND, CUBE, ToolFrame("palm", IDENTITY_POSE), "scene", 7 + np.arange(count), object_pose, named, placed, {}
@@ -169,13 +175,15 @@ def clearance(robot: Robot, states: np.ndarray, obstacle: Obstacle) -> float:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_a_transit_goes_around_what_is_in_its_way(name: str) -> None:
+@pytest.mark.parametrize("neighbour", [False, True])
+def test_a_transit_goes_around_what_is_in_its_way(name: str, neighbour: bool) -> None:
     robot = robot_of(name)
     direct = planner(name, executions()).plan(1)
     states = direct.targets[direct.phase == 0]
     middle = robot.poses(states)[0][1][len(states) // 2, 0]
     block = Obstacle.box(np.array([*middle[:3], 1, 0, 0, 0]), [0.08, 0.08, 0.08])
-    around = planner(name, executions((TABLE, block))).plan(1)
+    found = executions(beside=block) if neighbour else executions((TABLE, block))
+    around = planner(name, found).plan(1)
     assert isinstance(around, Motion), around
     states = around.targets[around.phase == 0]
     # Between two tested postures, 0.01 s apart at full velocity, a point can come nearer than the clearance.

@@ -6,8 +6,9 @@ import pytest
 
 from graspd.service.index.queries import rates
 from graspd.service.index.queries.overview import BatchCost
-from graspd.service.model.domain import JobRequest
+from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import NotFoundError
+from graspd.service.model.states import Stage
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.spec import Estimate
@@ -169,6 +170,31 @@ def test_grasps_in_scenes_have_a_price_of_their_own(services: Services) -> None:
     done(services, "placed", scene="table", scenes=2)
     placed = estimate(services.index, wanted(scene="table", scenes=2))
     assert placed.measured_share == 1 and placed.seconds_by_stage["scene"] == pytest.approx(4 * FAKE_SECONDS)
+
+
+def test_an_episode_costs_as_stored_then_as_one_of_the_same_robot_and_cameras() -> None:
+    made = JobRequest(hand="h", object="o", scene="table", episodes="flying")
+    batches = [
+        BatchCost("h", "o", "cpu", made, seconds, count, count, count, size)
+        for seconds, count, size in ((8.0, 4, 40_000), (0.1, 0, 9))
+    ]
+    found = {
+        robot: rates.episode_rate(
+            batches, JobOptions(scene="table", episodes=robot, film=film), rates.Machine(factor=2.0)
+        )
+        for robot, film in (("flying", ()), ("franka", ("scene", "wrist")))
+    }
+    assert (found["flying"].seconds, found["flying"].size_bytes, found["flying"].batches) == (2.0, 10_000, 1)
+    stored = [one + 2 * film for one, film in zip(rates.STORED_EPISODE, rates.STORED_FILM, strict=True)]
+    assert [found["franka"].seconds / 2, found["franka"].size_bytes] == stored
+
+
+def test_an_estimate_has_the_stage_of_episodes(services: Services) -> None:
+    plain, filmed = (estimate(services.index, wanted(scene="table", **more)) for more in ({}, {"episodes": "flying"}))
+    assert filmed.tasks - plain.tasks == plain.cells
+    assert filmed.seconds - plain.seconds == pytest.approx(filmed.seconds_by_stage[Stage.EPISODE])
+    assert filmed.seconds_by_stage[Stage.EPISODE] == pytest.approx(plain.valid * rates.STORED_EPISODE[0], rel=0.01)
+    assert filmed.storage_by_kind["episodes"] > 0
 
 
 def test_other_models_cost_what_they_take_of_each_valid_grasp(services: Services) -> None:
