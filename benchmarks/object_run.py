@@ -2,9 +2,10 @@
 
     python -m benchmarks.object_run --work DIR --objects 100 --grasps 32 --minutes 50
 
-Fetches the set, adds two published hands, and makes the datasets of examples/objects/free.toml and table.toml. Every
-few minutes a worker gets SIGKILL; once, at a third of a part of the objects, all processes do, and the same commands
-continue. The same command continues a run that ended early, and writes its page."""
+Checks the set, adds two published hands, and makes the datasets of examples/objects/free.toml and table.toml in parts
+of ten objects; objects of the report split come first. Every few minutes a worker gets SIGKILL; once, at a third of a
+part, all processes do, and the same commands continue. The same command continues a run that ended early, and writes
+its page."""
 
 from __future__ import annotations
 
@@ -31,9 +32,12 @@ import graspd
 from benchmarks.gallery import HANDS
 from benchmarks.matrix import ExecutionContext
 from graspd.api.formatting import duration, size
+from graspd.client.add_commands import upload_set
 from graspd.commands.objects import kind_of
+from graspd.service import user_cache
 from graspd.service.index.views import CellView
 from graspd.service.model.cores import available_cores
+from graspd.service.model.errors import GraspdError
 from graspd.service.model.states import AssetKind
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.readers.files import open_shards
@@ -52,9 +56,11 @@ GRIPPERS: Final = "robosuite/models/assets/grippers/"
 #: Object whose rate others are compared with, and its number of grasps per hand.
 MUG, MUG_GRASPS = "mug", 64
 #: Objects of one dataset; a run that ends early has whole parts with all hands.
-PART: Final = 20
+PART: Final = 10
 SHOWN, EDGE, WORST = 40, 176, 10
-_POLL_S, _PATIENCE_S = 5.0, 900.0
+_POLL_S, _PATIENCE_S, _TRIES, _WAIT_S = 5.0, 900.0, 6, 20.0
+#: A machine with other work may stop a worker's heartbeats for longer than the default.
+_SETTINGS: Final = {"GRASPD_LEASE_S": "45", "GRASPD_STOP_GRACE_S": "60"}
 
 
 @dataclass
@@ -66,6 +72,7 @@ class Kept:
     service_killed: int = 0
     peak_bytes: int = 0
     add_s: float = 0.0
+    added: list[str] = field(default_factory=list)
     fetched: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -80,7 +87,7 @@ def main(
     work: Annotated[Path, typer.Option(help="Folder of the service and of the run's state.")],
     out: Annotated[Path, typer.Option(help="Page to write.")] = Path("docs", "results", "objects.md"),
     name: Annotated[str, typer.Option("--set", help="Name of the published set.")] = "pybullet-random",
-    objects: Annotated[int, typer.Option(help="Number of objects, drawn at random; 0: all.")] = 100,
+    objects: Annotated[int, typer.Option(help="Number of objects, drawn by the command's seed; 0: all.")] = 100,
     grasps: Annotated[int, typer.Option(help="Valid grasps of each hand, object and scene.")] = 32,
     hands: Annotated[
         str, typer.Option(help="Names of hands, comma-separated.")
@@ -92,24 +99,27 @@ def main(
 ) -> None:
     """Run the datasets and write the page; the same command continues."""
     work.mkdir(parents=True, exist_ok=True)
-    end, began = time.monotonic() + 60 * minutes, time.monotonic()
-    run = ExecutionContext(work, {k: v for k, v in os.environ.items() if not k.startswith("GRASPD_")}, workers=workers)
+    end = time.monotonic() + 60 * minutes
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("GRASPD_")} | _SETTINGS
+    run = Service(work, environment, workers=workers)
     kept, state = Kept.load(work / "run.json"), work / "run.json"
+    if not kept.fetched:
+        folder = user_cache.cache_folder("sets") / f"{name}-{SETS[name].version}"
+        kept.fetched = run.graspd("objects", "fetch", name, "--to", str(folder), "--count", str(objects))
+        kept.save(state)
+    shapes = {one["name"]: one for one in kept.fetched["objects"] if one["verdict"] != "refuse"}
+    drawn = random.Random(0).sample(sorted(shapes), len(shapes))
+    drawn.sort(key=lambda name: shapes[name]["shape"]["split"] == "train")
     run.up()
     try:
-        if not kept.fetched:
-            kept.fetched = run.graspd("objects", "fetch", name, "--count", str(objects))
-            kept.add_s = time.monotonic() - began
-            kept.save(state)
-        add_hands(run, hands.split(","))
-        shapes = {one["name"]: one for one in kept.fetched["objects"] if one["verdict"] != "refuse"}
-        drawn = random.Random(0).sample(sorted(shapes), len(shapes))
-        parts = [drawn[start : start + PART] for start in range(0, len(drawn), PART)]
+        patiently(lambda: add_hands(run, hands.split(",")))
         create = Create(hands, scenes.split(","))
         follow(run, create.commands("mug", [MUG], MUG_GRASPS), kept, end=end)
         done: list[str] = []
-        for number, part in enumerate(parts):
-            wanted = create.commands(f"part-{number}", part, grasps)
+        for start in range(0, len(drawn), PART):
+            part = drawn[start : start + PART]
+            add_objects(run, kept, name, part)
+            wanted = create.commands(f"part-{start // PART}", part, grasps)
             follow(run, wanted, kept, end=end, kill_s=60 * kill_minutes)
             done += part
             kept.save(state)
@@ -118,7 +128,10 @@ def main(
         # Its cells are those of the parts, so nothing is made again.
         wanted = create.commands(f"objects-{len(done)}", done, grasps)
         follow(run, wanted, kept, end=end)
-        found = {one: list(run.client().cells(one)) for one in (*wanted, *create.commands("mug", [MUG], MUG_GRASPS))}
+        found = {
+            one: patiently(lambda one=one: list(run.client().cells(one)))
+            for one in (*wanted, *create.commands("mug", [MUG], MUG_GRASPS))
+        }
         timings = index_timings(run, list(wanted), work)
         sheet = out.with_suffix(".webp")
         draw_sheet(run, list(wanted), shapes, sheet)
@@ -127,6 +140,40 @@ def main(
     command = f"--set {name} --objects {objects} --grasps {grasps} --hands {hands} --scenes {scenes}"
     out.write_text(page(found, shapes, kept, timings, command, sheet.name, data=work / "data"))
     typer.echo(out.read_text())
+
+
+class Service(ExecutionContext):
+    """A service on a machine with other work: requests are repeated."""
+
+    def graspd(self, *arguments: str) -> dict[str, Any]:
+        return patiently(lambda: ExecutionContext.graspd(self, *arguments))
+
+
+def patiently(action: Callable[[], Any]) -> Any:
+    """Return the result of an action, which is repeated after errors of the service."""
+    for _ in range(_TRIES - 1):
+        try:
+            return action()
+        except (GraspdError, SystemExit) as error:
+            typer.echo(f"{time.strftime('%H:%M:%S')} again: {error}")
+            time.sleep(_WAIT_S)
+    return action()
+
+
+def add_objects(run: Service, kept: Kept, name: str, part: Sequence[str]) -> None:
+    """Add objects of the set that the service does not hold."""
+    if not (missing := [one for one in part if one not in kept.added]):
+        return
+    began, folder = time.monotonic(), Path(kept.fetched["folder"])
+    objects = {one: load_folder(folder / one) for one in missing}
+    patiently(lambda: upload_set(run.client(), objects, f"{name}-part"))
+    kept.added += missing
+    kept.add_s += time.monotonic() - began
+
+
+def load_folder(folder: Path) -> dict[str, bytes]:
+    files = (file for file in folder.rglob("*") if file.is_file() and file.name != "check.json")
+    return {file.relative_to(folder).as_posix(): file.read_bytes() for file in files}
 
 
 @dataclass(frozen=True)
@@ -145,7 +192,7 @@ class Create:
         }
 
 
-def add_hands(run: ExecutionContext, wanted: Sequence[str]) -> None:
+def add_hands(run: Service, wanted: Sequence[str]) -> None:
     """Add the published hands among those wanted from their package."""
     known = {asset.name for asset in run.client().assets(AssetKind.HAND)}
     entries = [one for one in HANDS if one.name in wanted and one.path.startswith(GRIPPERS) and one.name not in known]
@@ -164,9 +211,7 @@ def add_hands(run: ExecutionContext, wanted: Sequence[str]) -> None:
         typer.echo(run.client().wait_for_check(AssetKind.HAND, one.name, timeout_s=_PATIENCE_S).message)
 
 
-def follow(
-    run: ExecutionContext, wanted: dict[str, Sequence[str]], kept: Kept, *, end: float, kill_s: float = math.inf
-) -> None:
+def follow(run: Service, wanted: dict[str, Sequence[str]], kept: Kept, *, end: float, kill_s: float = math.inf) -> None:
     """Create the datasets and wait until they end or time is up; kill a worker every `kill_s`, and all at a third."""
     for command in wanted.values():
         run.graspd(*command)
@@ -175,7 +220,7 @@ def follow(
         now = time.monotonic()
         kept.seconds, last = kept.seconds + (now - last) * math.isfinite(kill_s), now
         kept.peak_bytes = max(kept.peak_bytes, memory_bytes(run.processes[0]))
-        views = [run.client().dataset(name) for name in wanted]
+        views = patiently(lambda: [run.client().dataset(name) for name in wanted])
         done, tasks = sum(view.tasks_done for view in views), sum(view.tasks for view in views)
         if done / max(1, tasks) > said + 0.02:
             said = done / max(1, tasks)
@@ -193,7 +238,7 @@ def follow(
                 run.graspd(*command)
         if now > killed + kill_s:
             killed = now
-            workers = run.client().send("GET", "/v1/workers").json()
+            workers = patiently(lambda: run.client().send("GET", "/v1/workers").json())
             busy = [one["pid"] for one in workers if one["state"] == "busy"]
             with suppress(ProcessLookupError, IndexError):
                 os.kill(random.choice(busy), signal.SIGKILL)
@@ -218,7 +263,7 @@ def memory_bytes(root: int) -> int:
     return total
 
 
-def index_timings(run: ExecutionContext, datasets: Sequence[str], work: Path) -> dict[str, float]:
+def index_timings(run: Service, datasets: Sequence[str], work: Path) -> dict[str, float]:
     """Return times of a page of grasps, of the facets of the grasps' page, and of a snapshot and a card [s]."""
 
     def time_of(action: Callable[[], Any], repeats: int = 5) -> float:
@@ -241,7 +286,7 @@ def index_timings(run: ExecutionContext, datasets: Sequence[str], work: Path) ->
     return found
 
 
-def draw_sheet(run: ExecutionContext, datasets: Sequence[str], shapes: dict[str, Any], file: Path) -> None:
+def draw_sheet(run: Service, datasets: Sequence[str], shapes: dict[str, Any], file: Path) -> None:
     """Draw random report objects, each with its best valid grasp by epsilon, as one sheet of WebP; hands take turns."""
     url = f"file://{run.folder / 'data' / 'store'}"
     held: dict[str, dict[str, tuple[float, Any, Any]]] = defaultdict(dict)
@@ -291,7 +336,7 @@ def page(
     facts = {
         "objects accepted": f"{kept.fetched['accepted']} of {len(kept.fetched['objects'])}",
         "CPU time of a check": f"p50 {times['p50']} s, p99 {times['p99']} s, largest {times['largest']:.2f} s",
-        "fetch, check and addition to the service": duration(kept.add_s),
+        "addition to the service": f"{duration(kept.add_s)} for {len(kept.added)} objects",
         "valid grasps": f"{valid:,} of {sum(cell.candidates for cell in every):,} candidates",
         "wall time": duration(kept.seconds),
         "worker time": duration(spent),
