@@ -38,13 +38,19 @@ from graspd.service import user_cache
 from graspd.service.index.views import CellView
 from graspd.service.model.cores import available_cores
 from graspd.service.model.errors import GraspdError
+from graspd.service.model.planning import format_outcomes
 from graspd.service.model.states import AssetKind
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.readers.files import open_shards
 from graspd.service.store.published_sets import SETS, fetch_objects, fetch_wheel, read_members
 from graspd.service.store.store import open_store
+from graspd.worker.hands.grasp_widths import largest_width
+from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.load import load_hand
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.shapes import CLASSES
+from graspd.worker.planners.fitting import FIT_M, antipodal_pairs
 from graspd.worker.rendering.pictures import grasp_pictures
 from graspd.worker.rendering.sheets import contact_sheet
 from graspd.worker.stages.assets import load_hand_files, prepared_object
@@ -59,7 +65,10 @@ MUG, MUG_GRASPS = "mug", 64
 PART: Final = 10
 #: Objects that are checked at once.
 STAGE: Final = 100
-SHOWN, EDGE, WORST = 40, 176, 10
+SHOWN, WORST = 40, 10
+SIZE: Final = (176, 176)
+#: Candidates of which failed ones are drawn.
+FAILED: Final = 64
 _POLL_S, _PATIENCE_S, _TRIES, _WAIT_S = 5.0, 900.0, 6, 20.0
 #: A machine with other work may stop a worker's heartbeats for longer than the default.
 _SETTINGS: Final = {"GRASPD_LEASE_S": "45", "GRASPD_STOP_GRACE_S": "60"}
@@ -75,6 +84,7 @@ class Kept:
     peak_bytes: int = 0
     add_s: float = 0.0
     added: list[str] = field(default_factory=list)
+    widths: dict[str, float] = field(default_factory=dict)
     fetched: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -102,6 +112,7 @@ def main(
     scenes: Annotated[str, typer.Option(help="free, table or both.")] = "free,table",
     workers: Annotated[int, typer.Option(help="Workers of the service.")] = 2,
     kill_minutes: Annotated[float, typer.Option(help="Minutes between two kills of a worker.")] = 6.0,
+    failures: Annotated[bool, typer.Option(help="Draw failed candidates of the worst cells.")] = True,
     minutes: Annotated[float, typer.Option(help="Write the page after this time, even if work remains.")] = math.inf,
 ) -> None:
     """Run the datasets and write the page; the same command continues."""
@@ -132,12 +143,21 @@ def main(
             for one in (*wanted, *create.commands("mug", [MUG], MUG_GRASPS))
         }
         timings = index_timings(run, list(wanted), work)
-        shapes, sheet = kept.shapes, out.with_suffix(".webp")
-        draw_sheet(run, list(wanted), shapes, sheet)
+        shapes, assets = kept.shapes, Assets(run)
+        sheet, failed = out.with_suffix(".webp"), out.with_name(f"{out.stem}-failures.webp")
+        fits = find_fits(assets, kept, hands.split(","), done)
+        kept.save(state)
+        draw_sheet(run, assets, list(wanted), shapes, sheet)
+        if failures:
+            draw_failures(run, assets, lowest(by_scene(found)), failed)
     finally:
         run.stop()
     command = f"--set {name} --objects {objects} --grasps {grasps} --hands {hands} --scenes {scenes}"
-    out.write_text(page(found, shapes, kept, timings, command, sheet.name, data=work / "data"))
+    out.write_text(
+        page(
+            found, shapes, kept, fits, timings, command, sheet.name, failed.name if failures else "", data=work / "data"
+        )
+    )
     typer.echo(out.read_text())
 
 
@@ -304,7 +324,83 @@ def index_timings(run: Service, datasets: Sequence[str], work: Path) -> dict[str
     return found
 
 
-def draw_sheet(run: Service, datasets: Sequence[str], shapes: dict[str, Any], file: Path) -> None:
+class Assets:
+    """Prepared hands and objects of a service, by name."""
+
+    def __init__(self, run: Service) -> None:
+        self.digests = {kind: {one.name: one.digest for one in run.client().assets(kind)} for kind in AssetKind}
+        self.store = open_store(f"file://{run.folder / 'data' / 'store'}", make=False)
+        self.hands: dict[str, HandModel] = {}
+
+    def hand(self, name: str) -> HandModel:
+        if name not in self.hands:
+            digest = self.digests[AssetKind.HAND][name]
+            self.hands[name] = load_hand(load_hand_files(self.store, digest), name=name, digest=digest)
+        return self.hands[name]
+
+    def object(self, name: str) -> ObjectModel:
+        return prepared_object(self.store, self.digests[AssetKind.OBJECT][name], name=name, face_error_m=3e-4)
+
+
+def opening(hand: HandModel) -> float:
+    """Return the largest distance of two opposed surfaces of a hand [m]."""
+    jaws = jaws_of(hand)
+    return largest_width(hand) if jaws is None else jaws.opening - 2 * FIT_M
+
+
+def least_width(obj: ObjectModel) -> float:
+    """Return the least distance of two opposite points of an object's surface [m]; inf without such points."""
+    return float(antipodal_pairs(obj).width.min(initial=math.inf))
+
+
+def find_fits(assets: Assets, kept: Kept, hands: Sequence[str], objects: Sequence[str]) -> set[tuple[str, str]]:
+    """Return the pairs of a hand and an object that is no wider than the hand's opening."""
+    kept.widths |= {one: least_width(assets.object(one)) for one in objects if one not in kept.widths}
+    openings = {hand: opening(assets.hand(hand)) for hand in hands}
+    return {(hand, one) for hand, most in openings.items() for one in objects if kept.widths[one] <= most}
+
+
+def rejections(data: Path) -> dict[tuple[str, str, str], Counter[str]]:
+    """Return the numbers of rejected candidates by outcome, for each hand, scene and object."""
+    found: dict[tuple[str, str, str], Counter[str]] = defaultdict(Counter)
+    for file in (data / "store" / "shards" / "base").glob("*.json"):
+        manifest = json.loads(file.read_bytes())
+        scene = "table" if manifest["request"].get("scene") else "free"
+        outcomes = manifest["info"].get("outcomes", {})
+        found[manifest["hand"], scene, manifest["object"]].update(outcomes)
+    return found
+
+
+def lowest(mine: dict[str, list[CellView]]) -> list[tuple[str, CellView]]:
+    """Return scenes and finished cells with the lowest shares of valid candidates, the slowest first among equals."""
+    cells = [(scene, one) for scene, cells in mine.items() for one in cells if one.state.is_final]
+    cells.sort(key=lambda pair: (yield_of([pair[1]]), -pair[1].seconds / max(1, pair[1].valid)))
+    return cells[:WORST]
+
+
+def draw_failures(run: Service, assets: Assets, cells: Sequence[tuple[str, CellView]], file: Path) -> None:
+    """Draw the best grasp of each cell, then failed candidates of a job that keeps them, as one sheet of WebP."""
+    pictures, captions = [], []
+    for scene, cell in cells:
+        spec = ("--hand", cell.hand, "--object", cell.object, "-n", str(FAILED), "--want", "candidates")
+        table = ("--scene", "table", "--scenes", "4") if scene == "table" else ()
+        told = run.graspd("submit", *spec, *table, "--object-friction", "0.6", "--wait")
+        grasps = graspd.open(f"file://{run.folder / 'data' / 'store'}", job=told["job"])
+        epsilon = np.where(grasps.is_valid, np.nan_to_num(grasps.metric("epsilon"), nan=0.0), -1.0)
+        rows = [int(epsilon.argmax()), *np.flatnonzero(~grasps.is_valid)[:3].tolist()]
+        poses = grasps.hand_pose[rows], grasps.joint_positions[rows]
+        drawn = grasp_pictures(assets.hand(cell.hand), assets.object(cell.object), *poses, SIZE, samples=8)
+        # Four pictures in a row.
+        pictures += [*drawn[:, 0], *[np.full_like(drawn[0, 0], 255)] * (4 - len(rows))]
+        best = "valid" if grasps.is_valid[rows[0]] else "failed"
+        captions += [[(cell.object.rpartition("-")[2], f"{cell.hand}, {scene}"), ("", best)]]
+        captions += [[("", "failed")]] * (len(rows) - 1) + [[]] * (4 - len(rows))
+    if pictures:
+        page = contact_sheet(np.array(pictures), captions, title="Best grasp, then failed candidates", columns=4)
+        Image.open(io.BytesIO(page)).convert("RGB").save(file, quality=60, method=6)
+
+
+def draw_sheet(run: Service, assets: Assets, datasets: Sequence[str], shapes: dict[str, Any], file: Path) -> None:
     """Draw random report objects, each with its best valid grasp by epsilon, as one sheet of WebP; hands take turns."""
     url = f"file://{run.folder / 'data' / 'store'}"
     held: dict[str, dict[str, tuple[float, Any, Any]]] = defaultdict(dict)
@@ -319,40 +415,46 @@ def draw_sheet(run: Service, datasets: Sequence[str], shapes: dict[str, Any], fi
                     held[str(name)][hand] = (float(epsilon[best]), *pose)
     report = [name for name in sorted(held) if held[name] and shapes[name]["shape"]["split"] == "report"]
     drawn = sorted(random.Random(0).sample(report, min(SHOWN, len(report))))
-    digests = {kind: {one.name: one.digest for one in run.client().assets(kind)} for kind in AssetKind}
-    store, pictures, captions = open_store(url, make=False), [], []
-    hands: dict[str, Any] = {}
+    pictures, captions = [], []
     for number, name in enumerate(drawn):
         hand = sorted(held[name])[number % len(held[name])]
-        if hand not in hands:
-            digest = digests[AssetKind.HAND][hand]
-            hands[hand] = load_hand(load_hand_files(store, digest), name=hand, digest=digest)
-        obj = prepared_object(store, digests[AssetKind.OBJECT][name], name=name, face_error_m=3e-4)
         _, pose, joints = held[name][hand]
-        pictures.append(grasp_pictures(hands[hand], obj, pose[None], joints[None], (EDGE, EDGE), samples=8)[0, 0])
+        pictures.append(
+            grasp_pictures(assets.hand(hand), assets.object(name), pose[None], joints[None], SIZE, samples=8)[0, 0]
+        )
         captions.append([(name.rpartition("-")[2], shapes[name]["shape"]["class"]), ("", hand)])
     if pictures:
         page = contact_sheet(np.array(pictures), captions, title="Report objects, best valid grasps", columns=8)
         Image.open(io.BytesIO(page)).convert("RGB").save(file, quality=60, method=6)
 
 
+def by_scene(found: dict[str, list[CellView]], prefix: str = "objects-") -> dict[str, list[CellView]]:
+    return {name.rpartition("-")[2]: cells for name, cells in found.items() if name.startswith(prefix)}
+
+
 def page(
     found: dict[str, list[CellView]],
     shapes: dict[str, Any],
     kept: Kept,
+    fits: set[tuple[str, str]],
     timings: dict[str, float],
     command: str,
     sheet: str,
+    failed: str,
     data: Path,
 ) -> str:
-    mine = {name.rpartition("-")[2]: cells for name, cells in found.items() if name.startswith("objects-")}
-    mug = {name.rpartition("-")[2]: cells for name, cells in found.items() if name.startswith("mug-")}
+    mine = by_scene(found)
+    mug = by_scene(found, "mug-")
     every = [cell for cells in mine.values() for cell in cells]
     valid, spent = sum(cell.valid for cell in every), sum(cell.seconds for cell in every)
-    times = kept.fetched["check_s"]
+    times, rejected = kept.fetched["check_s"], rejections(data)
+    report = {name for name, one in shapes.items() if one["shape"]["split"] == "report"}
+    whole = {one.object for one in every} - {one.object for one in every if not one.state.is_final}
     rate, of_mug = valid / max(spent, 1e-9), mug_rate(mine, mug)
     facts = {
         "objects accepted": f"{kept.fetched['accepted']} of {len(kept.fetched['objects'])}",
+        "report objects, of those checked": f"{len(report)}",
+        "finished with all hands and scenes": f"{len(whole & report)} report, {len(whole - report)} train objects",
         "CPU time of a check": f"p50 {times['p50']} s, p99 {times['p99']} s, largest {times['largest']:.2f} s",
         "addition to the service": f"{duration(kept.add_s)} for {len(kept.added)} objects",
         "valid grasps": f"{valid:,} of {sum(cell.candidates for cell in every):,} candidates",
@@ -382,14 +484,33 @@ def page(
         "",
         "## Hands",
         "",
-        "*1*, *all*: share of objects with at least one, and with all requested valid grasps. *Worst tenth*: mean "
-        "share of valid candidates over the tenth of objects with the lowest. *Time*: worker seconds per valid grasp, "
-        "and in brackets for the mug. Only finished cells count.",
+        "*Fit*: objects with two opposite surface points (normals within 20° of their line) no further apart "
+        "than the hand's opposed surfaces at their widest. *1*, *all*: share of these with at least one, and with all "
+        "requested valid grasps. *Worst tenth*: mean share of valid candidates over the tenth of objects with the "
+        "lowest. *Time*: worker seconds per valid grasp, and in brackets for the mug. Only finished cells count.",
         "",
         *table(
-            ("hand", "scene", "split", "objects", "valid / candidates", "yield", "1", "all", "worst tenth", "time"),
             (
-                (hand, scene, split, *figures(chosen), cost(chosen, [one for one in mug[scene] if one.hand == hand]))
+                "hand",
+                "scene",
+                "split",
+                "objects",
+                "fit",
+                "valid / candidates",
+                "yield",
+                "1",
+                "all",
+                "worst tenth",
+                "time",
+            ),
+            (
+                (
+                    hand,
+                    scene,
+                    split,
+                    *figures(chosen, fits),
+                    cost(chosen, [one for one in mug[scene] if one.hand == hand]),
+                )
                 for scene, cells in mine.items()
                 for hand in dict.fromkeys(one.hand for one in cells)
                 for split in ("train", "report")
@@ -400,9 +521,9 @@ def page(
         "## Shape classes",
         "",
         *table(
-            ("class", "scene", "cells", "valid / candidates", "yield", "1", "all", "worst tenth"),
+            ("class", "scene", "cells", "fit", "valid / candidates", "yield", "1", "all", "worst tenth"),
             (
-                (kind, scene, *figures(chosen))
+                (kind, scene, *figures(chosen, fits))
                 for kind in CLASSES
                 for scene, cells in mine.items()
                 if (chosen := ended(cells, shapes, **{"class": kind}))
@@ -426,9 +547,32 @@ def page(
             [(str(n), kind) for kind, n in Counter(kind_of(one.reason) for one in every if one.reason).most_common(12)],
         ),
         "",
-        f"The {WORST} objects with the lowest yield over all hands and scenes:",
+        "## Failures",
         "",
-        *table(("object", "class", "sides [mm]", "valid / candidates", "yield"), worst(every, shapes)),
+        "Outcomes of rejected candidates. *Repeated attempts* are further starts of the planner in scenes.",
+        "",
+        *table(
+            ("hand", "scene", "outcomes"),
+            (
+                (hand, scene, format_outcomes(lost) or "none")
+                for scene, cells in mine.items()
+                for hand in dict.fromkeys(one.hand for one in cells)
+                if (lost := sum((rejected[hand, scene, one.object] for one in cells if one.hand == hand), Counter()))
+            ),
+        ),
+        "",
+        f"The {WORST} cells with the lowest share of valid candidates:",
+        "",
+        *([f"![Best grasp and failed candidates of these cells]({failed})", ""] if failed else []),
+        *table(
+            (
+                *("object", "class", "split", "sides [mm]", "hand", "scene"),
+                "valid / candidates",
+                "time [s]",
+                "outcomes",
+            ),
+            (failure(scene, one, shapes, rejected[one.hand, scene, one.object]) for scene, one in lowest(mine)),
+        ),
     ]
     return "\n".join(lines) + "\n"
 
@@ -443,15 +587,18 @@ def yield_of(cells: Sequence[CellView]) -> float:
     return sum(one.valid for one in cells) / max(1, sum(one.candidates for one in cells))
 
 
-def figures(cells: Sequence[CellView]) -> tuple[str, ...]:
-    """Return number of cells, grasps, yield, shares of cells with one and all grasps, and yield of the worst tenth."""
+def figures(cells: Sequence[CellView], fits: set[tuple[str, str]]) -> tuple[str, ...]:
+    """Return numbers of cells, of those whose object fits, and of grasps; yield; shares of cells whose object fits
+    with one and all grasps; yield of the worst tenth."""
     shares = sorted(one.valid / max(1, one.candidates) for one in cells)
+    fitting = [one for one in cells if (one.hand, one.object) in fits]
     return (
         str(len(cells)),
+        str(len(fitting)),
         f"{sum(one.valid for one in cells)} / {sum(one.candidates for one in cells)}",
-        f"{yield_of(cells):.2f}",
-        f"{np.mean([one.valid >= 1 for one in cells]):.2f}",
-        f"{np.mean([one.valid >= one.asked for one in cells]):.2f}",
+        f"{yield_of(cells):.3f}",
+        f"{np.mean([one.valid >= 1 for one in fitting]):.3f}" if fitting else "",
+        f"{np.mean([one.valid >= one.asked for one in fitting]):.3f}" if fitting else "",
         f"{np.mean(shares[: -(-len(shares) // 10)]):.2f}",
     )
 
@@ -472,16 +619,13 @@ def mug_rate(mine: dict[str, list[CellView]], mug: dict[str, list[CellView]]) ->
     return grasps / seconds if seconds else 0.0
 
 
-def worst(cells: Sequence[CellView], shapes: dict[str, Any]) -> list[tuple[str, ...]]:
-    of: dict[str, list[CellView]] = defaultdict(list)
-    for one in cells:
-        if one.state.is_final:
-            of[one.object].append(one)
-    rows = []
-    for name in sorted(of, key=lambda name: yield_of(of[name]))[:WORST]:
-        facts, (_, made, share, *_) = shapes[name]["shape"], figures(of[name])
-        rows.append((name, facts["class"], " x ".join(f"{1e3 * side:.0f}" for side in facts["sides_m"]), made, share))
-    return rows
+def failure(scene: str, cell: CellView, shapes: dict[str, Any], lost: Counter[str]) -> tuple[str, ...]:
+    """Return a row of the table of the cells with the lowest yield."""
+    facts = shapes[cell.object]["shape"]
+    sides = " x ".join(f"{1e3 * side:.0f}" for side in facts["sides_m"])
+    time_s = f"{cell.seconds / max(1, cell.valid):.2f}"
+    about = (cell.object, facts["class"], facts["split"], sides, cell.hand, scene)
+    return (*about, f"{cell.valid} / {cell.candidates}", time_s, format_outcomes(lost) or (cell.reason or ""))
 
 
 def table(names: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

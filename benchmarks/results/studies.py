@@ -431,7 +431,7 @@ STUDIES: Final = (
     Study(
         "objects",
         "a published set of objects and five hands, with killed workers",
-        ("results/objects.*",),
+        ("results/objects*",),
         ("python -m benchmarks.object_run --work WORK/objects --out OUT/results/objects.md",),
         ("python -m benchmarks.object_run --work WORK/objects --objects 4 --grasps 8 --out OUT/results/objects.md",),
         stages=ALL,
