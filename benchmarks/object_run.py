@@ -382,6 +382,8 @@ def draw_failures(run: Service, assets: Assets, cells: Sequence[tuple[str, CellV
     """Draw the best grasp of each cell, then failed candidates of a job that keeps them, as one sheet of WebP."""
     pictures, captions = [], []
     for scene, cell in cells:
+        if cell.valid == cell.candidates:
+            continue
         spec = ("--hand", cell.hand, "--object", cell.object, "-n", str(FAILED), "--want", "candidates")
         table = ("--scene", "table", "--scenes", "4") if scene == "table" else ()
         told = run.graspd("submit", *spec, *table, "--object-friction", "0.6", "--wait")
@@ -390,13 +392,13 @@ def draw_failures(run: Service, assets: Assets, cells: Sequence[tuple[str, CellV
         rows = [int(epsilon.argmax()), *np.flatnonzero(~grasps.is_valid)[:3].tolist()]
         poses = grasps.hand_pose[rows], grasps.joint_positions[rows]
         drawn = grasp_pictures(assets.hand(cell.hand), assets.object(cell.object), *poses, SIZE, samples=8)
-        # Four pictures in a row.
-        pictures += [*drawn[:, 0], *[np.full_like(drawn[0, 0], 255)] * (4 - len(rows))]
-        best = "valid" if grasps.is_valid[rows[0]] else "failed"
-        captions += [[(cell.object.rpartition("-")[2], f"{cell.hand}, {scene}"), ("", best)]]
-        captions += [[("", "failed")]] * (len(rows) - 1) + [[]] * (4 - len(rows))
+        pictures += list(drawn[:, 0])
+        about = f"{cell.object.rpartition('-')[2]} {scene}"
+        captions += [[(about, cell.hand), ("", "valid" if grasps.is_valid[row] else "failed")] for row in rows]
     if pictures:
-        page = contact_sheet(np.array(pictures), captions, title="Best grasp, then failed candidates", columns=4)
+        page = contact_sheet(
+            np.array(pictures), captions, title="Best grasp of each cell, then failed candidates", columns=8
+        )
         Image.open(io.BytesIO(page)).convert("RGB").save(file, quality=60, method=6)
 
 
