@@ -52,7 +52,10 @@ MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
         "JAM_LOOKS",
         "RETREATS_M",
     ),
-    postures: ("PRESSING_M", "CLOSING_M", "TOTAL_NORMAL_FORCE", "OF_WEIGHT", "FRICTION", "MAX_PRESSING", "_POINTS"),
+    postures: (
+        *("PRESSING_M", "CLOSING_M", "FRICTION", "MAX_PRESSING", "_POINTS"),
+        *("TOTAL_NORMAL_FORCE", "OF_WEIGHT", "LEAST_NORMAL_FORCE"),
+    ),
     squeeze: ("SPREAD", "TORQUE", "SUM"),
     jaw_squeeze: ("GAP_M", "STALL", "LEAST_WAY"),
 }
