@@ -117,6 +117,8 @@ def main(
 ) -> None:
     """Run the datasets and write the page; the same command continues."""
     work.mkdir(parents=True, exist_ok=True)
+    # The service ends with the command.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     end = time.monotonic() + 60 * minutes
     environment = {k: v for k, v in os.environ.items() if not k.startswith("GRASPD_")} | _SETTINGS
     run = Service(work, environment, workers=workers)
