@@ -69,6 +69,8 @@ SHOWN, WORST = 40, 10
 SIZE: Final = (176, 176)
 #: Candidates of which failed ones are drawn.
 FAILED: Final = 64
+#: Planners that are compared, and candidates of each on an object.
+METHODS, PLANNED = ("fast_graspd", "autograsp", "graspit", "dfc"), 16
 _POLL_S, _PATIENCE_S, _TRIES, _WAIT_S = 5.0, 900.0, 6, 20.0
 #: A machine with other work may stop a worker's heartbeats for longer than the default.
 _SETTINGS: Final = {"GRASPD_LEASE_S": "45", "GRASPD_STOP_GRACE_S": "60"}
@@ -112,6 +114,7 @@ def main(
     scenes: Annotated[str, typer.Option(help="free, table or both.")] = "free,table",
     workers: Annotated[int, typer.Option(help="Workers of the service.")] = 2,
     kill_minutes: Annotated[float, typer.Option(help="Minutes between two kills of a worker.")] = 6.0,
+    compared: Annotated[int, typer.Option(help="Objects on which the first hand also uses other planners.")] = 0,
     failures: Annotated[bool, typer.Option(help="Draw failed candidates of the worst cells.")] = True,
     minutes: Annotated[float, typer.Option(help="Write the page after this time, even if work remains.")] = math.inf,
 ) -> None:
@@ -152,14 +155,12 @@ def main(
         draw_sheet(run, assets, list(wanted), shapes, sheet)
         if failures:
             draw_failures(run, assets, lowest(by_scene(found)), failed)
+        others = compare(run, hands.partition(",")[0], done[:compared])
     finally:
         run.stop()
+    pictures = sheet.name, failed.name if failures else ""
     command = f"--set {name} --objects {objects} --grasps {grasps} --hands {hands} --scenes {scenes}"
-    out.write_text(
-        page(
-            found, shapes, kept, fits, timings, command, sheet.name, failed.name if failures else "", data=work / "data"
-        )
-    )
+    out.write_text(page(found, shapes, kept, fits, timings, others, command, pictures, work / "data"))
     typer.echo(out.read_text())
 
 
@@ -404,6 +405,28 @@ def draw_failures(run: Service, assets: Assets, cells: Sequence[tuple[str, CellV
         Image.open(io.BytesIO(page)).convert("RGB").save(file, quality=60, method=6)
 
 
+def compare(run: Service, hand: str, objects: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return a row of figures of each planner on the same objects, free and at level dexgraspbench."""
+    rows = []
+    for method in METHODS if objects else ():
+        jobs: list[dict[str, Any]] = []
+        # All jobs wait in the queue before the first result is awaited.
+        for wait in ((), ("--wait",)):
+            jobs = [run.graspd("submit", *job_of(hand, one, method), *wait) for one in objects]
+        made, valid = (sum(job[key] for job in jobs) for key in ("grasps", "valid"))
+        spent = sum(job["stages"]["synthesize"]["seconds"] for job in jobs)
+        any_valid = np.mean([job["valid"] > 0 for job in jobs])
+        share = f"{valid / max(1, made):.3f}"
+        rows.append((method, str(len(jobs)), str(made), share, f"{any_valid:.2f}", f"{spent / max(1, valid):.2f}"))
+    return rows
+
+
+def job_of(hand: str, obj: str, method: str) -> tuple[str, ...]:
+    """Return options of a job that keeps all candidates."""
+    terms = ("--want", "candidates", "--validation", "dexgraspbench", "--object-friction", "0.6")
+    return ("--hand", hand, "--object", obj, "--method", method, "-n", str(PLANNED), *terms)
+
+
 def draw_sheet(run: Service, assets: Assets, datasets: Sequence[str], shapes: dict[str, Any], file: Path) -> None:
     """Draw random report objects, each with its best valid grasp by epsilon, as one sheet of WebP; hands take turns."""
     url = f"file://{run.folder / 'data' / 'store'}"
@@ -442,12 +465,12 @@ def page(
     kept: Kept,
     fits: set[tuple[str, str]],
     timings: dict[str, float],
+    others: list[tuple[str, ...]],
     command: str,
-    sheet: str,
-    failed: str,
+    pictures: tuple[str, str],
     data: Path,
 ) -> str:
-    mine = by_scene(found)
+    (sheet, failed), mine = pictures, by_scene(found)
     mug = by_scene(found, "mug-")
     every = [cell for cells in mine.values() for cell in cells]
     valid, spent = sum(cell.valid for cell in every), sum(cell.seconds for cell in every)
@@ -534,6 +557,7 @@ def page(
             ),
         ),
         "",
+        *planners_section(others, next(iter(every)).hand if every else ""),
         "## Refusals and repairs",
         "",
         *table(
@@ -621,6 +645,21 @@ def mug_rate(mine: dict[str, list[CellView]], mug: dict[str, list[CellView]]) ->
             if one.valid:
                 grasps, seconds = grasps + number, seconds + number * one.seconds / one.valid
     return grasps / seconds if seconds else 0.0
+
+
+def planners_section(rows: Sequence[tuple[str, ...]], hand: str) -> list[str]:
+    if not rows:
+        return []
+    return [
+        "## Planners",
+        "",
+        f"{hand}, free candidates at level `dexgraspbench`, all with graspd's pregrasp and squeeze. Other planners are "
+        "graspd's implementations of the published ones, with their default options. *Time*: worker seconds per valid "
+        "grasp, validation included.",
+        "",
+        *table(("planner", "objects", "candidates", "GSR", "OSR", "time"), rows),
+        "",
+    ]
 
 
 def failure(scene: str, cell: CellView, shapes: dict[str, Any], lost: Counter[str]) -> tuple[str, ...]:
