@@ -208,23 +208,25 @@ def verdicts(root: Path, config: str, tabletop: bool, file: Path) -> tuple[str, 
     return file.parts[-3], held, hard, *contact_metrics(found), posture
 
 
-def chosen_files(root: Path, config: str, tabletop: bool, most: int) -> Iterator[Path]:
+def chosen_files(root: Path, config: str, tabletop: bool, most: int, objects: str) -> Iterator[Path]:
     """Yield the first files of each object."""
     of: dict[str, list[Path]] = defaultdict(list)
     for file in sorted((root / "output" / f"graspd{'_tabletop' * tabletop}_{config}" / "graspdata").rglob("*.npy")):
         of[file.parts[-3]].append(file)
-    for files in of.values():
-        yield from files[: most or None]
+    for name, files in of.items():
+        if not objects or name in objects.split(","):
+            yield from files[: most or None]
 
 
 def main(
     root: Annotated[Path, typer.Argument(help="Folder of the export.")],
     config: Annotated[str, typer.Option(help="Name of the model of the hand, such as graspd_barrett.")],
     tabletop: Annotated[bool, typer.Option("--tabletop", help="Grasps on tables: lifts instead of pushes.")] = False,
+    objects: Annotated[str, typer.Option(help="Names of objects, comma-separated; default: all.")] = "",
     most: Annotated[int, typer.Option(help="Grasps of each object, the first ones; 0: all.")] = 0,
 ) -> None:
     """Print GSR, OSR, GSR at low friction, PD, CDC and D."""
-    files = list(chosen_files(root, config, tabletop, most))
+    files = list(chosen_files(root, config, tabletop, most, objects))
     with ProcessPoolExecutor(2) as pool:
         rows = list(pool.map(partial(verdicts, root, config, tabletop), files, chunksize=4))
     objects = {row[0]: any(one[1] for one in rows if one[0] == row[0]) for row in rows}

@@ -24,6 +24,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
+import h5py
 import numpy as np
 import typer
 from PIL import Image
@@ -87,6 +88,7 @@ class Kept:
     add_s: float = 0.0
     added: list[str] = field(default_factory=list)
     widths: dict[str, float] = field(default_factory=dict)
+    repeated: dict[str, bool] = field(default_factory=dict)
     fetched: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -115,6 +117,7 @@ def main(
     workers: Annotated[int, typer.Option(help="Workers of the service.")] = 2,
     kill_minutes: Annotated[float, typer.Option(help="Minutes between two kills of a worker.")] = 6.0,
     compared: Annotated[int, typer.Option(help="Objects on which the first hand also uses other planners.")] = 0,
+    again: Annotated[int, typer.Option(help="Finished cells that an empty service makes again.")] = 1,
     failures: Annotated[bool, typer.Option(help="Draw failed candidates of the worst cells.")] = True,
     minutes: Annotated[float, typer.Option(help="Write the page after this time, even if work remains.")] = math.inf,
 ) -> None:
@@ -155,6 +158,9 @@ def main(
         draw_sheet(run, assets, list(wanted), shapes, sheet)
         if failures:
             draw_failures(run, assets, lowest(by_scene(found)), failed)
+        finished = [(scene, one) for scene, cells in by_scene(found).items() for one in cells if one.state.is_final]
+        kept.repeated |= make_again(run, kept, random.Random(again).sample(finished, min(again, len(finished))))
+        kept.save(state)
         others = compare(run, hands.partition(",")[0], done[:compared])
     finally:
         run.stop()
@@ -405,6 +411,39 @@ def draw_failures(run: Service, assets: Assets, cells: Sequence[tuple[str, CellV
         Image.open(io.BytesIO(page)).convert("RGB").save(file, quality=60, method=6)
 
 
+def make_again(run: Service, kept: Kept, cells: Sequence[tuple[str, CellView]]) -> dict[str, bool]:
+    """Make cells in an empty service; return whether each of its shards has the arrays of the run's shard."""
+    other = Service(run.folder / "again", dict(run.environment), workers=1)
+    other.folder.mkdir(exist_ok=True)
+    other.up()
+    try:
+        for scene, cell in cells:
+            add_hands(other, [cell.hand])
+            files = {cell.object: load_folder(Path(kept.fetched["folder"]) / cell.object)}
+            patiently(lambda files=files: upload_set(other.client(), files, "again"))
+            create = Create(cell.hand, [scene])
+            follow(
+                other, create.commands(f"{cell.hand}-{cell.object}", [cell.object], cell.asked), Kept(), end=math.inf
+            )
+    finally:
+        other.stop()
+    found = {}
+    for file in sorted((other.folder / "data" / "store" / "shards").rglob("*.h5")):
+        first, second = (
+            folder / "data" / file.relative_to(other.folder / "data") for folder in (run.folder, other.folder)
+        )
+        found[file.stem] = first.is_file() and arrays_of(first) == arrays_of(second)
+    return found
+
+
+def arrays_of(file: Path) -> dict[str, tuple[str, tuple[int, ...], bytes]]:
+    """Return type, shape and bytes of each array of a shard."""
+    found = {}
+    with h5py.File(file) as shard:
+        shard.visititems(lambda name, item: found.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
+    return {name: (str(array.dtype), array.shape, array.tobytes()) for name, array in found.items()}
+
+
 def compare(run: Service, hand: str, objects: Sequence[str]) -> list[tuple[str, ...]]:
     """Return a row of figures of each planner on the same objects, free and at level dexgraspbench."""
     rows = []
@@ -492,6 +531,7 @@ def page(
         else f"{rate:.2f}",
         "workers killed": f"{kept.workers_killed}, and {kept.service_killed} time all processes",
         "failed attempts, each repeated": str(sum(cell.attempts_failed for cell in every)),
+        "shards made again in an empty service": f"{sum(kept.repeated.values())} of {len(kept.repeated)} bit-identical",
         "unfinished cells": f"{sum(not cell.state.is_final for cell in every)} of {len(every)}",
         "peak memory of all processes": size(kept.peak_bytes),
         "disk: shards; all data": f"{size(folder_bytes(data / 'store' / 'shards'))}; {size(folder_bytes(data))}",
