@@ -462,7 +462,7 @@ def compare(run: Service, hand: str, objects: Sequence[str]) -> list[tuple[str, 
 
 def job_of(hand: str, obj: str, method: str) -> tuple[str, ...]:
     """Return options of a job that keeps all candidates."""
-    terms = ("--want", "candidates", "--validation", "dexgraspbench", "--object-friction", "0.6")
+    terms = ("--want", "candidates", "--validation", "dexgraspbench")
     return ("--hand", hand, "--object", obj, "--method", method, "-n", str(PLANNED), *terms)
 
 
