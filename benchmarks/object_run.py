@@ -166,6 +166,7 @@ def main(
         run.stop()
     pictures = sheet.name, failed.name if failures else ""
     command = f"--set {name} --objects {objects} --grasps {grasps} --hands {hands} --scenes {scenes}"
+    command += f" --compared {compared}" * bool(compared)
     out.write_text(page(found, shapes, kept, fits, timings, others, command, pictures, work / "data"))
     typer.echo(out.read_text())
 
