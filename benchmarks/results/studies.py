@@ -434,8 +434,8 @@ STUDIES: Final = (
         ("results/objects*",),
         (
             "python -m benchmarks.object_run --work WORK/objects --out OUT/results/objects.md",
-            "python -m benchmarks.object_run --work WORK/planners --objects 12 --grasps 4 --hands allegro --scenes free "
-            "--compared 5 --no-failures --out OUT/results/objects-planners.md",
+            "python -m benchmarks.object_run --work WORK/planners --objects 12 --grasps 4 --hands allegro --scenes "
+            "free --compared 5 --no-failures --out OUT/results/objects-planners.md",
         ),
         ("python -m benchmarks.object_run --work WORK/objects --objects 4 --grasps 8 --out OUT/results/objects.md",),
         stages=ALL,
