@@ -526,6 +526,7 @@ def page(
         "addition to the service": f"{duration(kept.add_s)} for {len(kept.added)} objects",
         "valid grasps": f"{valid:,} of {sum(cell.candidates for cell in every):,} candidates",
         "wall time": duration(kept.seconds),
+        "load of the machine at the end, of all programs": f"{os.getloadavg()[2]:.0f} on {available_cores()} cores",
         "worker time": duration(spent),
         "valid grasps per worker second": f"{rate:.2f}, {rate / of_mug:.0%} of the mug's {of_mug:.2f}"
         if of_mug
