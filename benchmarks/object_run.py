@@ -554,7 +554,7 @@ def page(
         "## Hands",
         "",
         "*Fit*: objects with two opposite surface points (normals within 20° of their line) no further apart than the "
-        "widest gap of the hand's opposed pads, times 1.06, plus 6 mm; for grippers, than their opening less 2 mm. *1*, "
+        "widest gap of the hand's opposed pads, times 1.06, plus 6 mm; for grippers, their opening less 2 mm. *1*, "
         "*all*: share of these with at least one, and with all requested valid grasps. *Worst tenth*: mean share of "
         "valid candidates over the tenth of objects with the lowest. *Time*: worker seconds per valid grasp, and in "
         "brackets for the mug. Only finished cells count.",
