@@ -70,7 +70,7 @@ class AssetChoice:
 
 
 def choose_asset(request: Request, assets: Assets, fields: FormData, kind: AssetKind) -> AssetChoice:
-    """Return the hand or object of a submitted form: an uploaded file, the file that the form refers to, or a known
+    """Return the hand or object of a form: an upload, the file that the form refers to, or a known
     asset."""
     file, known = fields.get(FILE_FIELDS[kind]), _field_text(fields, kind.value)
     if isinstance(file, UploadFile) and file.filename:

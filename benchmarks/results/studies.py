@@ -691,6 +691,25 @@ STUDIES: Final = (
         seeds=(5,),
     ),
     Study(
+        "films",
+        "animation of two episodes: an arm and a flying hand lift a mug",
+        ("images/episodes.webp",),
+        (
+            "graspd synth --hand allegro --object mug --scene table -n 4 --seed 5 -o WORK/arm.h5",
+            "graspd episodes create WORK/arm.h5 --arm ur10e --film scene,wrist --limit 4 --seed 2 -o WORK/film-arm.h5",
+            "graspd synth --hand barrett --object mug --scene table -n 4 --seed 5 -o WORK/fly.h5",
+            "graspd episodes create WORK/fly.h5 --film scene,wrist --limit 4 --seed 2 -o WORK/film-fly.h5",
+            "python -m benchmarks.films WORK/film-arm.h5 WORK/film-fly.h5 -o OUT/images/episodes.webp",
+        ),
+        (
+            "graspd synth --hand barrett --object block --scene table --scenes 1 -n 1 -o WORK/fly.h5",
+            "graspd episodes create WORK/fly.h5 --film scene,wrist -o WORK/film-fly.h5",
+            "python -m benchmarks.films WORK/film-fly.h5 -o OUT/images/episodes.webp",
+        ),
+        IN_SCENES,
+        seeds=(5, 2),
+    ),
+    Study(
         "grasp-pictures",
         "pictures of grasps on many objects",
         ("images/grasps/*",),

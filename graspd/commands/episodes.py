@@ -46,7 +46,7 @@ def create(
     output: Annotated[Path, typer.Option("--output", "-o", help="HDF5 file to write.")] = Path("episodes.h5"),
     json: JsonFlag = False,
 ) -> None:
-    """Execute the valid grasps of a file: transit, approach, closing, lift and hold; failures remain, labelled."""
+    """Execute the valid grasps of a file, from the transit to the hold; failures remain, labelled."""
     shard = read_shard(grasps, kind="base")
     options = EpisodeOptions(arm, mount, mount_pose, base, fps, seed, limit)
     model, thing = hand_of_shard(shard, hand), object_of_shard(shard, object)

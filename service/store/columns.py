@@ -19,7 +19,7 @@ def schema_name(kind: str) -> str:
 
 @dataclass(frozen=True)
 class Column:
-    """Dataset of a shard. Equal letters in `shape` mean equal lengths in the whole shard; `*` is any length."""
+    """Dataset of a shard. Equal letters in `shape` mean equal lengths in a shard; `*` is any length."""
 
     shape: str
     dtype: str

@@ -1,4 +1,4 @@
-"""Motions: timed targets of a robot that executes one grasp, from its home posture to the lifted object."""
+"""Motions: timed targets of a robot for one grasp, from its home posture to the lifted object."""
 
 from dataclasses import dataclass
 from typing import Final

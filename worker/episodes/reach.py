@@ -56,7 +56,7 @@ BUILTIN_ARMS: Final = {
 
 
 def read_arm(path: str | pathlib.Path, mount: str | None, hand_pose: Floats) -> Arm:
-    """Read a built-in arm, or one from a URDF, its folder or a ZIP, without links below the mount, such as a gripper.
+    """Read a built-in arm, or a URDF, its folder or a ZIP, without links below the mount, such as a gripper.
     Joints that do not lead to the mount are fixed at zero, or at the nearest value inside their limits. A built-in arm
     has the mount `flange`. Raises InputError: there is no such arm, no link `mount`, or no joint moves it."""
     builtin = BUILTIN_ARMS.get(str(path))
@@ -195,7 +195,7 @@ class ReachSearch:
         return None, reason
 
     def attempts(self, row: int) -> Iterator[tuple[list[Path] | None, str]]:
-        """Yield the motions of one grasp, or None and the reason, from each of `STARTS` postures; the first is home."""
+        """Yield the motions of a grasp, or None and the reason, from `STARTS` postures; the first is home."""
         long, short = (straight_paths(self.found, row, points) for points in (LONG, SHORT))
         ways = [a if a.phase in _LONG_PHASES else b for a, b in zip(long, short, strict=True)]
         rng, arm = np.random.default_rng(int(self.found.rows[row])), self.arm.model
@@ -271,7 +271,7 @@ class ReachSearch:
         return np.asarray(step * min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-9)))
 
     def _collision(self, joined: list[Floats], ways: list[Path], row: int) -> str:
-        """Return the first pair of the arm and another body that collides on the trajectory; else an empty text."""
+        """Return the first pair with the arm that collides on the trajectory; else an empty text."""
         rest = np.asarray(self.found.object_pose[row], float)
         self.world.place_neighbours(row)
         for arm, path in zip(joined, ways, strict=True):

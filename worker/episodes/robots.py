@@ -1,4 +1,4 @@
-"""Robots of episodes: a hand at the flange of an arm, whose base stands behind the object, or a flying hand."""
+"""Robots of episodes: a hand on an arm, whose base stands behind the object, or a flying hand."""
 
 from dataclasses import replace
 from typing import Final
@@ -44,7 +44,7 @@ def _rest_poses(mounting: HandModel) -> Floats:
 
 
 def adapter_pose(hand: HandModel) -> Floats:
-    """Return the pose (7,) of the hand's root link in the flange's frame, whose z axis points away from the arm.
+    """Return the pose (7,) of the hand's root link in the flange's frame; its z axis leaves the arm.
     z is the palm's approach direction; with a forearm, z is the direction from its far end to the palm. The rear of the
     palm or forearm is `ADAPTER_M` before the flange, centred."""
     if hand.mounting is None:
@@ -69,7 +69,7 @@ def rotation_between(a: Floats, b: Floats) -> Floats:
 
 
 def carry_mounting(arm: Arm, hand: HandModel) -> Arm:
-    """Return the arm with the hand's forearm, its wrist at rest, as a part of the body that carries the mount."""
+    """Return the arm with the hand's forearm, wrist at rest, as a part of the body of the mount."""
     if hand.mounting is None:
         return arm
     poses = compose(compose(arm.mount_pose, arm.hand_pose), _rest_poses(hand.mounting))

@@ -114,7 +114,7 @@ def record_episodes(
 def replay_episodes(
     shard: Shard, *, hand: str | None = None, obj: str | None = None, run: ExecutionContext = DEFAULT_CONTEXT
 ) -> list[Episode]:
-    """Execute the stored actions of a shard's episodes again; return these with their new frames and outcomes.
+    """Execute the stored actions of a shard's episodes again; return these with new frames and outcomes.
     Raises NotFoundError: hand, object or arm is not found, see `find_files`. ConflictError: it is another one."""
     model, thing, placed = hand_of_shard(shard, hand), object_of_shard(shard, obj), scenes_of_shard(shard)
     assert placed is not None, "the schema requires scenes"
@@ -134,7 +134,7 @@ def replay_episodes(
 
 
 def robot_of_shard(shard: Shard, hand: HandModel) -> Robot:
-    """Return the robot of a shard of episodes. Raises ConflictError: the arm's files changed; NotFoundError."""
+    """Return the robot of a shard. Raises ConflictError: the arm's files changed; NotFoundError."""
     said = {name: str(value) for name, value in shard.attributes.items() if name.startswith("arm")}
     if "arm" not in said:
         return Robot(hand)
@@ -147,7 +147,7 @@ def robot_of_shard(shard: Shard, hand: HandModel) -> Robot:
 
 
 def episode_columns(episodes: list[Episode], none: Episode, placed: PlacedGrasps) -> dict[str, NDArray[Any]]:
-    """Return the columns of a shard of episodes, except those of the grasps' quality; `none` has no frames."""
+    """Return the columns of episodes, except those of the grasps' quality; `none` has no frames."""
     columns: dict[str, NDArray[Any]] = {
         "episode/row": np.array([one.row for one in episodes], np.int32),
         "episode/scene_index": np.array([one.scene for one in episodes], np.int32),

@@ -1,4 +1,4 @@
-"""Execution of motions in MuJoCo: the validator's model of the hand with its drives, the object at its mass, an arm.
+"""Execution of motions in MuJoCo: the validator's model of hand and object, and an arm.
 
 The world is the scene's frame. Gravity acts on object and neighbours; hand and arm are gravity-compensated. The robot
 is commanded by float32 actions at the frames of an episode. Between frames, targets move evenly, root quaternions after
@@ -176,7 +176,7 @@ class Simulation:
 
 
 def _motion(poses: Floats, start: Floats, centre: Floats) -> tuple[Floats, Floats]:
-    """Return displacements (...) of a point [m] and rotations (...) [rad] of poses (..., 7) from another one (7,)."""
+    """Return displacements (...) of a point [m] and rotations (...) [rad] of poses (..., 7) from one (7,)."""
     turn = quat_multiply(quat_conjugate(start[3:]), poses[..., 3:])
     angle = 2 * np.arctan2(np.linalg.norm(turn[..., 1:], axis=-1), np.abs(turn[..., 0]))
     return np.linalg.norm(apply(poses, centre) - apply(start, centre), axis=-1), np.asarray(angle)

@@ -26,7 +26,7 @@ _FINE: Final = np.linspace(0.0, 1.0, 401)  # times at which limits are tested, o
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Limits of a robot's state (D,). The root pose of a flying hand has two: of its position and of its rotation."""
+    """Limits of a robot's state (D,). A flying root has two: of its position and of its rotation."""
 
     velocity: Floats  # (L,) [m/s or rad/s]
     acceleration: Floats  # (L,) [m/s^2 or rad/s^2]
@@ -74,7 +74,7 @@ class MotionLimits:
         return found
 
     def timed(self, path: Floats, nominal: float, step: float) -> Floats:
-        """Return states (T, D) at times `step` [s] apart, without the start; the duration is at least `nominal` [s]."""
+        """Return states (T, D) every `step` [s], without the start; the duration is at least `nominal` [s]."""
         slow = self.curve(path, minimum_jerk(_FINE))
         velocity = self.rates(np.diff(slow, axis=0)) * (len(_FINE) - 1) / self.velocity
         acceleration = self.rates(np.diff(slow, 2, axis=0)) * (len(_FINE) - 1) ** 2 / self.acceleration
@@ -83,7 +83,7 @@ class MotionLimits:
         return self.curve(path, minimum_jerk(np.arange(1, count + 1) / count))
 
     def resampled(self, corners: Floats, points: int) -> Floats:
-        """Return states (points, D) on lines between corners (C, D), at equal shares of the time at full velocity."""
+        """Return states (points, D) on lines between corners (C, D), at equal times at full velocity."""
         corners = self.continuous(corners)
         times = (self.rates(np.diff(corners, axis=0)) / self.velocity).max(axis=1)
         at = np.concatenate([[0.0], np.cumsum(np.maximum(times, 1e-9))])

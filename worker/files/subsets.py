@@ -24,7 +24,7 @@ Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
 
 
 def open_source(source: str) -> Shards:
-    """Return the shards of a file or folder, or of a dataset by name or a job by id in this machine's store.
+    """Return the shards of a file or folder, or of a dataset or a job in this machine's store.
     Raises NotFoundError: none of these exists."""
     if "/" in source or source in (".", "..") or Path(source).exists():
         return open_shards(Path(source))
