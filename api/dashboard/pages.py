@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import AsyncIterable
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, FastAPI, Form, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
@@ -216,7 +216,6 @@ def usage_page(request: Request, usage: dependencies.UsageOf, since: Since = Non
 
 #: Number of characters of a job's id that its page shows, and that confirm its deletion.
 SHORT_ID = 12
-Typed = Annotated[str, Form(max_length=64)]
 
 
 @router.get("/deleted", dependencies=dependencies.READ)
@@ -234,37 +233,26 @@ def restore(what: What, name: str, deletions: dependencies.DeletionsOf) -> Redir
     return redirect(where, f"The {what} {found.name} is restored.")
 
 
-@router.post("/datasets/{name}/delete", dependencies=dependencies.SUBMIT)
-def delete_dataset(
-    name: str, datasets: dependencies.DatasetsOf, typed: Typed = "", with_snapshots: Annotated[bool, Form()] = False
+@router.post("/{kind}/{name}/delete", dependencies=dependencies.SUBMIT)
+def delete(
+    kind: Literal["datasets", "jobs", "tags"],
+    name: str,
+    datasets: dependencies.DatasetsOf,
+    jobs: dependencies.JobsOf,
+    tags: dependencies.TagsOf,
+    typed: Annotated[str, Form(max_length=64)] = "",
+    with_snapshots: Annotated[bool, Form()] = False,
 ) -> RedirectResponse:
-    _require_confirmation(typed, name)
-    datasets.delete(name, with_snapshots=with_snapshots)
-    return _redirect_to_deletions(name)
-
-
-@router.post("/jobs/{job_id}/delete", dependencies=dependencies.SUBMIT)
-def delete_job(job_id: str, jobs: dependencies.JobsOf, typed: Typed = "") -> RedirectResponse:
-    _require_confirmation(typed, job_id, job_id[:SHORT_ID])
-    jobs.delete(job_id)
-    return _redirect_to_deletions(job_id)
-
-
-@router.post("/tags/{name}/delete", dependencies=dependencies.SUBMIT)
-def delete_tag(name: str, tags: dependencies.TagsOf, typed: Typed = "") -> RedirectResponse:
-    _require_confirmation(typed, name)
-    tag = tags.get(name)
-    tags.delete(name)
-    return _redirect_to_deletions(tag.id)
-
-
-def _require_confirmation(typed: str, *names: str) -> None:
-    if typed.strip() not in names:
-        raise InputError(f"nothing was deleted; to confirm the deletion, type {names[-1]}")
-
-
-def _redirect_to_deletions(id: str) -> RedirectResponse:
-    return RedirectResponse(f"/deleted?done={id}", status_code=303)
+    """Delete after the name, or the first characters of a job's id, was typed."""
+    short = name[:SHORT_ID] if kind == "jobs" else name
+    if typed.strip() not in (name, short):
+        raise InputError(f"nothing was deleted; to confirm the deletion, type {short}")
+    done = tags.get(name).id if kind == "tags" else name
+    if kind == "datasets":
+        datasets.delete(name, with_snapshots=with_snapshots)
+    else:
+        (jobs if kind == "jobs" else tags).delete(name)
+    return RedirectResponse(f"/deleted?done={done}", status_code=303)
 
 
 routers: Final = (
