@@ -33,15 +33,8 @@ from graspd.service.settings import Settings
 _log = logging.getLogger("graspd.api")
 #: Routers of all resources except assets and datasets, in the order of the OpenAPI document.
 _ROUTERS: Final = (
-    jobs.router,
-    grasps.router,
-    jobs.shard_router,
-    system.router,
-    assets.correction_router,
-    grasps.tag_router,
-    system.usage_router,
-    system.event_router,
-    system.deletion_router,
+    *(jobs.router, grasps.router, jobs.shard_router, system.router, assets.correction_router, grasps.tag_router),
+    *(system.usage_router, system.event_router, system.deletion_router),
 )
 _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 

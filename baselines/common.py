@@ -88,7 +88,12 @@ def inner_side_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoi
     """Spread points evenly on the surfaces that close.
     There are at most `each` points per closing link, and at most `on_palm` on the palm."""
     points = sample_surface(hand, SAMPLES)
-    inside = _inner_side_mask(hand, points)
+    before, after = (posed_points(hand, points, hand.preshape + t * hand.closing) for t in (0.0, STEP))
+    motion = after[0] - before[0]
+    speed = np.linalg.norm(motion, axis=1)
+    along = np.einsum("ni,ni->n", motion, before[1]) / np.maximum(speed, 1e-12)
+    ahead = before[1] @ hand.palm.approach
+    inside = np.where(speed > 1e-3 * STEP, along > INSIDE_COS, (points.body == 0) & (ahead > INSIDE_COS))
     chosen: list[NDArray[np.intp]] = []
     for body in range(hand.bodies):
         mine = np.flatnonzero((points.body == body) & inside)
@@ -97,12 +102,3 @@ def inner_side_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoi
             chosen.append(mine[farthest_points(points.position[mine], count)])
     index = np.sort(np.concatenate(chosen)) if chosen else np.zeros(0, np.intp)
     return SurfacePoints(points.body[index], points.position[index], points.normal[index], points.area[index])
-
-
-def _inner_side_mask(hand: HandModel, points: SurfacePoints) -> NDArray[np.bool_]:
-    before, after = (posed_points(hand, points, hand.preshape + t * hand.closing) for t in (0.0, STEP))
-    motion = after[0] - before[0]
-    speed = np.linalg.norm(motion, axis=1)
-    along = np.einsum("ni,ni->n", motion, before[1]) / np.maximum(speed, 1e-12)
-    ahead = before[1] @ hand.palm.approach
-    return np.where(speed > 1e-3 * STEP, along > INSIDE_COS, (points.body == 0) & (ahead > INSIDE_COS))

@@ -105,7 +105,7 @@ def photograph(address: str, places: dict[str, str], folder: Path, only: set[str
         ("home", "/", "#jobs tbody tr", LAPTOP, "light", False),
         ("datasets", "/datasets", ".matrix", LAPTOP, "light", False),
         ("dataset", "/datasets/kitchen-1", ".matrix", LAPTOP, "dark", False),
-        ("job", f"/jobs/{places['viewed']}", "#best canvas[data-state=ready]", LAPTOP, "light", True),
+        ("job", f"/jobs/{places['viewed']}", "#best .grasp", LAPTOP, "light", True),
         ("job-running", f"/jobs/{places['running']}", "#stages", LAPTOP, "dark", False),
         ("grasps", "/grasps", "#found canvas[data-state=ready]", LAPTOP, "light", False),
         ("grasp", f"/grasps/{places['grasp']}", ".viewer[data-state=ready]", (1440, 1000), "light", False),

@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from graspd.exchange.bench_scene import scenes_on_tables
-from graspd.exchange.imported import ImportedGrasps, joints_by_name, parse_verdicts, scaled_object
 from graspd.exchange.plan import ExportPart, ExportSummary
 from graspd.service import parquet
 from graspd.service.model.errors import InputError
@@ -23,7 +21,6 @@ from graspd.service.readers.clouds import CloudView
 from graspd.service.readers.trajectories import scene_spec_of
 from graspd.service.store.shards import Shard
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.hands.load import hand_from_path
 from graspd.worker.rendering.export import PNG_STEP_M
 from graspd.worker.rendering.sheets import metric_at_threshold
 
@@ -200,56 +197,3 @@ def png(pixels: NDArray[Any]) -> dict[str, Any]:
     data = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(data, format="PNG", compress_level=1)
     return {"bytes": data.getvalue(), "path": None}
-
-
-def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read a file, or `grasps/*.parquet` of a folder; free grasps and grasps on tables are separate sets.
-    Raises InputError: columns are missing or invalid, or `object_name` selects no single object."""
-    files = [path] if path.is_file() else sorted((path / "grasps").glob("*.parquet"))
-    columns: dict[str, list[Any]] = {}
-    for file in files:
-        for name, values in parquet.read(file, GRASPS).items():
-            columns.setdefault(name, []).extend(values)
-    needed = ["object", "joint_names", *(f"{name}_{what}" for name in POSTURES for what in ("pose", "joints"))]
-    if missing := [name for name in needed if name not in columns]:
-        raise InputError(f"{path} has no column {missing[0]!r}, so it is no table of grasps")
-    columns["object"] = list(map(str, columns["object"]))
-    names = sorted(set(columns["object"]))
-    if len(names) != 1 and object_name not in names:
-        raise InputError(f"{path} has grasps on {', '.join(names[:8]) or 'nothing'}; select one object: --name")
-    wanted = object_name or names[0]
-    kinds = columns.get("scene_kind", [])
-    if len(kinds) != len(columns["object"]):
-        kinds = [FREE] * len(columns["object"])
-    rows = [k for k, name in enumerate(columns["object"]) if name == wanted]
-    if other := {kinds[k] for k in rows} - {FREE, TABLE}:
-        raise InputError(f"{path} has grasps for scenes of the kind {sorted(other)[0]!r}; use table or free")
-    sets = {kind: [k for k in rows if kinds[k] == kind] for kind in (FREE, TABLE)}
-    return [
-        _imported_grasps(path, hand, obj, wanted, columns, some, on_table=kind == TABLE)
-        for kind, some in sets.items()
-        if some
-    ]
-
-
-def _imported_grasps(
-    path: Path, hand: str, obj: str, name: str, columns: dict[str, list[Any]], rows: list[int], *, on_table: bool
-) -> ImportedGrasps:
-    model, thing = hand_from_path(hand), scaled_object(obj)
-    try:
-        joints = {tuple(columns["joint_names"][k]) for k in rows}
-        (order,) = joints if len(joints) == 1 else ((),)
-        parts = {}
-        for what in POSTURES:
-            pose = np.array([columns[f"{what}_pose"][k] for k in rows], float).reshape(len(rows), 7)
-            values = np.array([columns[f"{what}_joints"][k] for k in rows], float)
-            parts[what] = Posture(pose, joints_by_name(model, order, values, what=str(path)))
-        verdict = parse_verdicts([columns["verdict"][k] for k in rows]) if "verdict" in columns else None
-        place = np.array([columns["object_pose"][k] for k in rows], float) if on_table else None
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is no table of grasps: {error}") from None
-    grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], np.full(len(rows), np.nan))
-    placed = None if place is None else scenes_on_tables(place)
-    if placed is not None:
-        grasps.scene = placed.index
-    return ImportedGrasps(model, thing, grasps, name, 1.0, verdict, placed)

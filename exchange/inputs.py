@@ -74,15 +74,11 @@ def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) ->
     if not path.is_file():
         raise NotFoundError(f"{path} does not exist")
     if path.suffix != ".json":
-        return _load_shard(path, hand, obj)
+        shard = read_shard(path, kind="base")
+        return case_of_shard(shard, hand_of_shard(shard, hand), object_of_shard(shard, obj))
     (found,) = published.read_reference(path, hand=hand, obj=obj)
     friction = published.stored_friction(path)
     return Case(path.name, found.hand, found.obj, found.grasps, friction=friction, published=found.published)
-
-
-def _load_shard(path: Path, hand: str | None, obj: str | None) -> Case:
-    shard = read_shard(path, kind="base")
-    return case_of_shard(shard, hand_of_shard(shard, hand), object_of_shard(shard, obj))
 
 
 def case_of_shard(shard: Shard, model: HandModel, thing: ObjectModel) -> Case:

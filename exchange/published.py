@@ -66,19 +66,14 @@ def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Impor
         raise InputError(f"{path}: object {number} has grasps of shape {place.shape} and joints of {values.shape}")
     model, thing = hand_from_path(hand), scaled_object(obj)
     pose = np.concatenate([place[:, :3], place[:, 6:], place[:, 3:6]], axis=1)
-    names = _barrett_joint_names(model)
-    grasp = Posture(pose, joints_by_name(model, names, values * _closing_signs(model, names), what=str(path)))
-    return [ImportedGrasps(model, thing, add_postures(model, thing, grasp), thing.name)]
-
-
-def _barrett_joint_names(hand: HandModel) -> list[str]:
     names = []
     for role in ROLES:
-        found = [name for name in hand.joint_names if re.search(role, name)]
+        found = [name for name in model.joint_names if re.search(role, name)]
         if len(found) != 1:
-            raise InputError(f"{hand.name} is no Barrett hand: not exactly one joint matches {role!r}")
+            raise InputError(f"{model.name} is no Barrett hand: not exactly one joint matches {role!r}")
         names.append(found[0])
-    return names
+    grasp = Posture(pose, joints_by_name(model, names, values * _closing_signs(model, names), what=str(path)))
+    return [ImportedGrasps(model, thing, add_postures(model, thing, grasp), thing.name)]
 
 
 def _closing_signs(hand: HandModel, names: list[str]) -> Floats:

@@ -4,7 +4,6 @@ Feature: https://nvidia.github.io/simready-foundation/latest/features/FET_005_ST
 a line (`BasisCurves`) below the default prim, named `grasp_identifier...`, along which opposing fingers close; PMT.001
 is a physics material on each collider. Hand frames, joint positions and provenance are below `graspd`."""
 
-import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
 
 from graspd.exchange.inputs import Case, load_case
 from graspd.exchange.plan import ExportSummary, prim_name
+from graspd.service.model.digests import file_sha256
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, pose_to_matrix
 from graspd.service.store.shards import Shard, read_shard
@@ -144,7 +144,7 @@ class _Asset:
         told: dict[str, Any] = {"hand": hand.name, "hand_digest": hand.digest, "object_digest": found.case.obj.digest}
         told |= {name: said[name] for name in _TOLD if name in said}
         if found.shard.path is not None:
-            told["grasps_sha256"] = hashlib.sha256(found.shard.path.read_bytes()).hexdigest()
+            told["grasps_sha256"] = file_sha256(found.shard.path)
         group.GetPrim().SetCustomDataByKey("graspd", told)
         epsilon = metric_at_threshold(found.shard.arrays, "quality/epsilon")
         parts = {name: Posture.from_columns(found.shard.arrays, name) for name in ("grasp", "pregrasp", "squeeze")}
@@ -164,21 +164,18 @@ class _Asset:
             curve.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(curve, 0))
             at = group.GetPath().AppendChild(f"grasp_{name.rpartition('_')[2]}")
             curve.GetPrim().CreateRelationship("graspd:frame").SetTargets([at])
-            frame = self._add_frame(at, parts["grasp"].hand_pose[row])
+            # The frame of the root link at the grasp [m], without scale.
+            matrix = pose_to_matrix(parts["grasp"].hand_pose[row])
+            matrix[:3, 3] /= self.metres
+            frame = UsdGeom.Xform.Define(self.stage, at)
+            frame.AddTransformOp().Set(Gf.Matrix4d((self.to_root @ matrix).T))
+            frame = frame.GetPrim()
             frame.CreateAttribute("graspd:row", kinds.Int).Set(row)
             frame.CreateAttribute("graspd:epsilon", kinds.Double).Set(float(epsilon[row]))
             frame.CreateAttribute("graspd:jointNames", kinds.StringArray).Set(list(hand.joint_names))
             for key, part in parts.items():
                 joints = frame.CreateAttribute(f"graspd:{key}:jointPositions", kinds.DoubleArray)
                 joints.Set(part.joint_positions[row].tolist())
-
-    def _add_frame(self, path: Any, pose: Floats) -> Any:
-        """Add the frame of the hand's root link at a pose (7,) in the object frame [m], without scale."""
-        matrix = pose_to_matrix(pose)
-        matrix[:3, 3] /= self.metres
-        frame = UsdGeom.Xform.Define(self.stage, path)
-        frame.AddTransformOp().Set(Gf.Matrix4d((self.to_root @ matrix).T))
-        return frame.GetPrim()
 
     def add_physics(self, case: Case, written: ExportSummary) -> None:
         """Add a rigid body, colliders, mass and a physics material where the object has none."""

@@ -41,7 +41,7 @@ class TrainingExportOptions:
 def export_training(source: str, format_: str, wishes: TrainingExportOptions, folder: Path) -> ExportSummary:
     """Write the grasps of all shards of a folder or a dataset in a training format.
     Raises InputError: the share is invalid, no shard has suitable grasps, or the format refuses them."""
-    from graspd.exchange import dexgraspnet2, dexlearn, graspgen, huggingface, lerobot
+    from graspd.exchange import dexlearn, graspgen, huggingface, lerobot
 
     shards = open_source(source)
     if format_ == "lerobot":
@@ -51,9 +51,9 @@ def export_training(source: str, format_: str, wishes: TrainingExportOptions, fo
     out = split_objects(lots, wishes.held_out)
     if format_ == "graspgen":
         return graspgen.write(lots, folder, out)
-    columns = COLUMNS if format_ in ("dexlearn", "dexgraspnet2") else (*COLUMNS, "image/rgb")
+    columns = COLUMNS if format_ == "dexlearn" else (*COLUMNS, "image/rgb")
     pictures = Pictures(shards, columns, grasp_quality=(), valid=not wishes.every, unvalidated=wishes.unvalidated)
-    writer = {"dexlearn": dexlearn.write, "dexgraspnet2": dexgraspnet2.write, "huggingface": huggingface.write}[format_]
+    writer = dexlearn.write if format_ == "dexlearn" else huggingface.write
     return writer(lots, pictures, folder, out, parse_depth_noise(wishes.noise or None))
 
 

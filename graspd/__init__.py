@@ -45,27 +45,9 @@ _LIVES_IN: Final = {
     **dict.fromkeys(("Client", "Job"), "graspd.remote"),
 }
 
-__all__ = [
-    "BusyError",
-    "Client",
-    "ConflictError",
-    "DamagedError",
-    "Grasp",
-    "GraspdError",
-    "Grasps",
-    "HandError",
-    "InputError",
-    "Job",
-    "LimitError",
-    "MeshError",
-    "NotFoundError",
-    "Postures",
-    "TaskError",
-    "UnavailableError",
-    "__version__",
-    "open",
-    "synthesize",
-]
+__all__ = ["BusyError", "Client", "ConflictError", "DamagedError", "Grasp", "GraspdError", "Grasps", "HandError"]
+__all__ += ["InputError", "Job", "LimitError", "MeshError", "NotFoundError", "Postures", "TaskError"]
+__all__ += ["UnavailableError", "__version__", "open", "synthesize"]
 
 
 def __getattr__(name: str) -> Any:

@@ -7,8 +7,6 @@ from typing import Any, Final
 
 from graspd.service.model.errors import InputError
 
-#: Limit of the unpacked size that a file states [bytes].
-LARGEST: Final = 2**31
 #: Type of pictures for Hugging Face's readers: bytes and path of a file.
 IMAGE: Final = "image"
 
@@ -51,17 +49,3 @@ def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]
             out.write_table(pa.Table.from_pylist([dict(row) for row in rows], schema=schema))
             count += len(rows)
     return count
-
-
-def read(file: Path, wanted: Iterable[str]) -> dict[str, list[Any]]:
-    """Read those wanted columns that a file has; InputError for no Parquet file or more than `LARGEST`."""
-    pa = import_pyarrow()
-    try:
-        with pa.parquet.ParquetFile(file) as found:
-            names = [name for name in wanted if name in found.schema_arrow.names]
-            size = sum(found.metadata.row_group(k).total_byte_size for k in range(found.num_row_groups))
-            if size > LARGEST:
-                raise InputError(f"{file} unpacks to {size >> 20} MiB; split it into files below {LARGEST >> 20} MiB")
-            return dict(found.read(columns=names).to_pydict())
-    except (OSError, pa.ArrowException, MemoryError) as error:
-        raise InputError(f"{file} is not a readable Parquet file: {error}") from None

@@ -51,7 +51,13 @@ def bench(
     because waiting threads are busy there."""
     first = fidelities[0]
     nominal = load(first.face_error_m)
-    start = _start_times(hand, nominal, first, device)
+    # The first grasp of a process loads or compiles kernels.
+    seconds = []
+    for seed in (0, 1):
+        began = time.perf_counter()
+        optimise_batch(hand, nominal, PlanRequest(1, first, seed), ExecutionContext(device, threads=1))
+        seconds.append(round(time.perf_counter() - began, 3))
+    start = {"first_grasp_s": seconds[0], "next_grasp_s": seconds[1]}
     runs = []
     for fidelity in fidelities:
         obj = load(fidelity.face_error_m)
@@ -75,16 +81,6 @@ def bench(
         "kernels": kernel_shares(pair_of(hand, nominal, first, device), first, min(32, max(batches))),
         "runs": runs,
     }
-
-
-def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str) -> dict[str, float]:
-    """Return seconds to the first grasp of this process, which loads or compiles kernels, and to the next."""
-    seconds = []
-    for seed in (0, 1):
-        began = time.perf_counter()
-        optimise_batch(hand, obj, PlanRequest(1, fidelity, seed), ExecutionContext(device, threads=1))
-        seconds.append(round(time.perf_counter() - began, 3))
-    return {"first_grasp_s": seconds[0], "next_grasp_s": seconds[1]}
 
 
 def _time_combination(

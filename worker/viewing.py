@@ -148,7 +148,15 @@ class Viewer:
         """Start the server on the first free port from number `port` on; 0 takes any free port.
         Raises InputError: the file holds no grasps, or the address cannot be used."""
         self._shown, self._arrays = shown, shown.shard.arrays
-        self._choices = _rows_by_filter(shown.shard)
+        found: dict[str, NDArray[np.intp]] = {}
+        for name in ("valid", "lift_hard", "feasible"):
+            column = shown.shard.arrays.get(f"quality/{name}")
+            if column is not None and (rows := np.flatnonzero(np.asarray(column) > 0)).size:
+                found["lifts at half friction" if name == "lift_hard" else f"{name} only"] = rows
+        count = len(shown.shard["grasp/hand_pose"])
+        if not count:
+            raise InputError("the file holds no grasps")
+        self._choices = found | {"all": np.arange(count)}
         self._rows = next(iter(self._choices.values()))
         self._at, self._lock = 0, threading.RLock()
         spec = trajectories.scene_spec_of(shown.shard) or SceneSpec()
@@ -158,7 +166,19 @@ class Viewer:
         self._way = trajectories.trajectory_of(shown.shard, self.row)
         self._controls()
         self._load_grasp()
-        self._aim_camera()
+        pose = np.concatenate([self.models.rest.position, self.models.rest.wxyz])
+        points = quat_rotate(pose[3:], self._shown.obj.hull_vertices) + pose[:3]
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        palm = quat_rotate(pose[3:], quat_rotate(self._way[-1].hand_pose[3:], self._shown.hand.palm.approach))
+        first = float(np.arctan2(palm[1], palm[0]) + 0.5 * np.pi)
+        eyes = [
+            middle + _EYE_M * np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+            for e in (0.45, 0.8)
+            for a in (first + _STEP * ((k + 1) // 2) * (-1) ** k for k in range(16))
+        ]
+        eye = next((eye for eye in eyes if visible_share(self._supports, eye, points) > 0.8), eyes[0])
+        camera = self.server.initial_camera
+        camera.position, camera.look_at, camera.up, camera.fov = eye, middle, (0.0, 0.0, 1.0), 0.75
 
     def __repr__(self) -> str:
         return f"<viewer at {self.url}>"
@@ -252,22 +272,6 @@ class Viewer:
         self._figures.content = _metrics_text(shard, row)
         self.show()
 
-    def _aim_camera(self) -> None:
-        """Look at the object from a side that no support hides, if possible perpendicular to the approach."""
-        pose = np.concatenate([self.models.rest.position, self.models.rest.wxyz])
-        points = quat_rotate(pose[3:], self._shown.obj.hull_vertices) + pose[:3]
-        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        palm = quat_rotate(pose[3:], quat_rotate(self._way[-1].hand_pose[3:], self._shown.hand.palm.approach))
-        first = float(np.arctan2(palm[1], palm[0]) + 0.5 * np.pi)
-        eyes = [
-            middle + _EYE_M * np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
-            for e in (0.45, 0.8)
-            for a in (first + _STEP * ((k + 1) // 2) * (-1) ** k for k in range(16))
-        ]
-        eye = next((eye for eye in eyes if visible_share(self._supports, eye, points) > 0.8), eyes[0])
-        camera = self.server.initial_camera
-        camera.position, camera.look_at, camera.up, camera.fov = eye, middle, (0.0, 0.0, 1.0), 0.75
-
 
 def _start_server(host: str, port: int) -> Any:
     import viser
@@ -282,18 +286,6 @@ def _start_server(host: str, port: int) -> Any:
             return viser.ViserServer(host=host, port=port, label="graspd view", verbose=False)
     except OSError as error:
         raise InputError(f"cannot serve on {host}: {error.strerror or error}") from None
-
-
-def _rows_by_filter(shard: Shard) -> dict[str, NDArray[np.intp]]:
-    found: dict[str, NDArray[np.intp]] = {}
-    for name in ("valid", "lift_hard", "feasible"):
-        column = shard.arrays.get(f"quality/{name}")
-        if column is not None and (rows := np.flatnonzero(np.asarray(column) > 0)).size:
-            found["lifts at half friction" if name == "lift_hard" else f"{name} only"] = rows
-    count = len(shard["grasp/hand_pose"])
-    if not count:
-        raise InputError("the file holds no grasps")
-    return found | {"all": np.arange(count)}
 
 
 def _metrics_text(shard: Shard, row: int) -> str:

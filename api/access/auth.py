@@ -13,8 +13,10 @@ import hashlib
 import hmac
 import ipaddress
 import re
+from collections.abc import Callable
 from contextvars import ContextVar
-from typing import Final
+from functools import partial
+from typing import Any, Final, Generic, ParamSpec, TypeVar
 
 from starlette.datastructures import Headers
 from starlette.requests import HTTPConnection
@@ -22,10 +24,13 @@ from starlette.types import Scope as AsgiScope
 
 from graspd.api.access.keys import Key, KeyFile, Scope
 from graspd.api.problems import ApiError
+from graspd.service.index.index import Index
 from graspd.service.model.errors import InputError
 from graspd.service.model.projects import EVERYTHING, PATTERN, ProjectScope
 from graspd.service.settings import Settings
 
+P = ParamSpec("P")
+T = TypeVar("T")
 SESSION_COOKIE: Final = "graspd_session"
 #: Headers that proxies add; they reveal that a request may come from another machine.
 _OF_PROXIES: Final = ("x-forwarded-for", "x-forwarded-host", "forwarded", "via", "x-real-ip")
@@ -42,6 +47,16 @@ def project_scope() -> ProjectScope:
     """Return the projects that the caller sees: its own; all for `admin`, and while there are no keys."""
     key = caller.get()
     return EVERYTHING if key is None else ProjectScope(key.project, everything=key.scope.includes(Scope.ADMIN))
+
+
+class InScope(Generic[P, T]):
+    """Method of a class with `_services`: a query of the index, limited to the caller's scope."""
+
+    def __init__(self, query: Callable[[Index], Callable[P, T]]) -> None:
+        self._query = query
+
+    def __get__(self, catalog: Any, kind: type) -> Callable[P, T]:
+        return partial(self._query(catalog._services.index), scope=project_scope())  # type: ignore[arg-type]
 
 
 class ForeignResource(ApiError):

@@ -90,18 +90,14 @@ class Quotas:
         if key is None:
             yield claim
             return
-        self._check_gpu_seconds(key.project)
+        most = self._limits_of(key.project).gpu_seconds_per_day if key.project else None
+        if most and (used := self._gpu_seconds(key.project, f"{datetime.now(UTC):%Y-%m-%d}")) >= most:
+            used_up = f"the project {key.project!r} has used {used:.0f} of the {most} GPU seconds allowed per day"
+            raise QuotaError(f"{used_up}; submit more tomorrow (UTC)", retry_after_s=_until_midnight())
         with ExitStack() as claimed:
             for holder in self._holders(key):
                 claimed.enter_context(self._count_claim(holder, claim, job, grasps, is_new=is_new))
             yield claim
-
-    def _check_gpu_seconds(self, project: str) -> None:
-        """Raise QuotaError if a project's GPU seconds of today are used up; its earlier jobs continue."""
-        most = self._limits_of(project).gpu_seconds_per_day if project else None
-        if most and (used := self._gpu_seconds(project, f"{datetime.now(UTC):%Y-%m-%d}")) >= most:
-            used_up = f"the project {project!r} has used {used:.0f} of the {most} GPU seconds allowed per day"
-            raise QuotaError(f"{used_up}; submit more tomorrow (UTC)", retry_after_s=_until_midnight())
 
     def _holders(self, key: Key) -> list[_Holder]:
         own, default = key.limits, self._settings

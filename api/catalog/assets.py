@@ -3,12 +3,12 @@
 import io
 import json
 import logging
-from collections.abc import Collection, Mapping, MutableMapping
+from collections.abc import Mapping, MutableMapping
 from dataclasses import replace
 from typing import Final
 
-from graspd.api.access.auth import caller_id, project_scope, require_ownership
-from graspd.service.index.views import AssetView, Page
+from graspd.api.access.auth import InScope, caller_id, project_scope, require_ownership
+from graspd.service.index.views import AssetView
 from graspd.service.model import names
 from graspd.service.model.digests import digest_files
 from graspd.service.model.errors import ConflictError, DamagedError, LimitError, NotFoundError
@@ -17,16 +17,8 @@ from graspd.service.model.projects import EVERYTHING, ProjectScope, project_mark
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline import deletion
 from graspd.service.pipeline.backends import Services, record_transaction
-from graspd.service.store import library
+from graspd.service.store import descriptions, library
 from graspd.service.store.assets import ZipFiles, asset_json
-from graspd.service.store.descriptions import (
-    MAX_BYTES,
-    HandCorrections,
-    HandFacts,
-    apply_corrections,
-    parse_json_object,
-    read_hand_facts,
-)
 from graspd.service.store.integrity import get_sealed, put_document
 from graspd.service.store.network_file import network_report
 
@@ -40,18 +32,9 @@ class Assets:
     def __init__(self, services: Services) -> None:
         self._services = services
 
-    def page(
-        self, kind: AssetKind, *, limit: int = 50, cursor: str | None = None, refused: bool = False
-    ) -> Page[AssetView]:
-        scope = project_scope()
-        return self._services.index.assets.page(kind, limit=limit, cursor=cursor, refused=refused, scope=scope)
-
-    def get(self, kind: AssetKind, name: str) -> AssetView:
-        return self._services.index.assets.get(kind, name, scope=project_scope())
-
-    def datasets_of(self, digests: Collection[str]) -> dict[str, list[str]]:
-        """Return the names of the datasets that use each hand or object."""
-        return self._services.index.datasets.users_of(digests, scope=project_scope())
+    page = InScope(lambda index: index.assets.page)
+    get = InScope(lambda index: index.assets.get)
+    datasets_of = InScope(lambda index: index.datasets.users_of)
 
     def files(self, asset: AssetView) -> Mapping[str, bytes]:
         return library.load_asset_files(self._services.store, asset.kind, asset.digest)
@@ -99,11 +82,11 @@ class Assets:
             index.write.add_asset(asset, library.load_check(store, kind, asset.digest), within=connection)
         return self.get(kind, asset.digest)
 
-    def hand_facts(self, asset: AssetView) -> HandFacts:
+    def hand_facts(self, asset: AssetView) -> descriptions.HandFacts:
         """Return facts and guesses about a hand; raise ConflictError if an older version made its model."""
-        return read_hand_facts(self.model(asset))
+        return descriptions.read_hand_facts(self.model(asset))
 
-    def correct(self, name: str, corrections: HandCorrections, new_name: str = "") -> AssetView:
+    def correct(self, name: str, corrections: descriptions.HandCorrections, new_name: str = "") -> AssetView:
         """Create a hand from the same files with corrected facts; by default its name gets a number."""
         hand = self.get(AssetKind.HAND, name)
         facts = self.hand_facts(hand)
@@ -111,10 +94,10 @@ class Assets:
         files = ZipFiles(io.BytesIO(archive), limit_bytes=library.UNPACKED_LIMIT_BYTES)
         if digest_files(AssetKind.HAND, files) != hand.digest:
             raise DamagedError(f"the files of the hand {hand.name!r} in the store are damaged; upload it again")
-        said = parse_json_object(asset_json(files), "asset.json")
-        text = json.dumps(apply_corrections(said, facts, corrections)).encode()
-        if len(text) > MAX_BYTES:
-            raise LimitError(f"the corrected asset.json exceeds {MAX_BYTES} bytes; give fewer corrections")
+        said = descriptions.parse_json_object(asset_json(files), "asset.json")
+        text = json.dumps(descriptions.apply_corrections(said, facts, corrections)).encode()
+        if len(text) > descriptions.MAX_BYTES:
+            raise LimitError(f"the corrected asset.json exceeds {descriptions.MAX_BYTES} bytes; give fewer corrections")
         files["asset.json"] = text
         if not new_name:
             for mark in ({}, project_mark(files, project_scope().project)):

@@ -10,12 +10,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
-from graspd.api.access.auth import caller, caller_id, project_scope, require_ownership
+from graspd.api.access.auth import InScope, caller, caller_id, project_scope, require_ownership
 from graspd.api.access.quotas import DATASET_PREFIX, Quotas
 from graspd.api.catalog.grasps import MEAN_METRICS
 from graspd.service.index.queries.grasps import GraspFilter, Metric
 from graspd.service.index.queries.statistics import Distribution
-from graspd.service.index.views import CellView, DatasetView, MatrixCell, ObjectSetView, Page, SnapshotView
+from graspd.service.index.views import CellView, DatasetView, ObjectSetView
 from graspd.service.model.records import Snapshot
 from graspd.service.model.states import State
 from graspd.service.pipeline import deletion
@@ -64,29 +64,18 @@ class Datasets:
     def estimate(self, matrix: Matrix) -> Estimate:
         return estimate(self._services.index, matrix, FidelityResolver(self._services.store), scope=project_scope())
 
-    def page(self, *, limit: int = 50, cursor: str | None = None) -> Page[DatasetView]:
-        return self._services.index.datasets.page(limit=limit, cursor=cursor, scope=project_scope())
-
-    def get(self, name: str) -> DatasetView:
-        return self._services.index.datasets.get(name, scope=project_scope())
-
-    def cells(
-        self, name: str, *, state: State | None = None, limit: int = 50, cursor: str | None = None
-    ) -> Page[CellView]:
-        """Return cells (hand x object) of a dataset with their jobs, ordered by hand."""
-        return self._services.index.datasets.cells(name, state=state, limit=limit, cursor=cursor, scope=project_scope())
-
-    def matrix(self) -> list[MatrixCell]:
-        """Return each pair of hand and object that has a job, with or without a dataset."""
-        return self._services.index.overview.matrix(scope=project_scope())
+    page = InScope(lambda index: index.datasets.page)
+    get = InScope(lambda index: index.datasets.get)
+    cells = InScope(lambda index: index.datasets.cells)
+    matrix = InScope(lambda index: index.overview.matrix)
+    snapshots = InScope(lambda index: index.datasets.snapshots)
+    object_sets = InScope(lambda index: index.object_sets.newest_versions)
+    object_set = InScope(lambda index: index.object_sets.get)
 
     def take_snapshot(self, name: str) -> tuple[Snapshot, bool]:
         """Record the dataset's present shards; return the snapshot, and whether it is new."""
         self.get(name)
         return actions.take_snapshot(self._services, name)
-
-    def snapshots(self, name: str, *, limit: int = 50, cursor: str | None = None) -> Page[SnapshotView]:
-        return self._services.index.datasets.snapshots(name, limit=limit, cursor=cursor, scope=project_scope())
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
         self.get(name)
@@ -102,12 +91,6 @@ class Datasets:
             scope=project_scope(),
             may_follow=lambda owner, project: require_ownership(owner, f"the set {name!r}", project),
         )
-
-    def object_sets(self) -> list[ObjectSetView]:
-        return self._services.index.object_sets.newest_versions(scope=project_scope())
-
-    def object_set(self, name: str) -> ObjectSetView:
-        return self._services.index.object_sets.get(name, scope=project_scope())
 
     def compare(self, one: str, other: str) -> Comparison:
         both = self.get(one), self.get(other)

@@ -13,7 +13,7 @@ from anyio.to_thread import run_sync
 from fastapi import Request
 from fastapi.sse import ServerSentEvent
 
-from graspd.api.access.auth import caller, caller_id, is_still_authorized, may_change, project_scope, require_ownership
+from graspd.api.access import auth
 from graspd.api.access.keys import Scope
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.catalog.overview import Overview
@@ -35,7 +35,7 @@ _ENDS_AT_ONCE: Final = 100
 async def job_events(jobs: Jobs, job_id: str, request: Request) -> AsyncIterator[ServerSentEvent]:
     """Send `progress` with the job at each change, and `end` when its state is final."""
     last = ""
-    while not await request.is_disconnected() and is_still_authorized(request, Scope.READ):
+    while not await request.is_disconnected() and auth.is_still_authorized(request, Scope.READ):
         try:
             job = await run_sync(jobs.get_progress, job_id)
         except UnavailableError as error:
@@ -55,7 +55,7 @@ async def job_events(jobs: Jobs, job_id: str, request: Request) -> AsyncIterator
 
 async def end_events(webhooks: Webhooks, since: int, request: Request) -> AsyncIterator[ServerSentEvent]:
     """Send `end` for each job or dataset that ended after number `since`."""
-    while not await request.is_disconnected() and is_still_authorized(request, Scope.READ):
+    while not await request.is_disconnected() and auth.is_still_authorized(request, Scope.READ):
         try:
             found = await run_sync(partial(webhooks.end_events, since, limit=_ENDS_AT_ONCE))
         except UnavailableError as error:
@@ -72,7 +72,7 @@ async def end_events(webhooks: Webhooks, since: int, request: Request) -> AsyncI
 async def service_events(overview: Overview, request: Request) -> AsyncIterator[ServerSentEvent]:
     """Send `progress` without content when a job, task or worker changed."""
     last = ""
-    while not await request.is_disconnected() and is_still_authorized(request, Scope.READ):
+    while not await request.is_disconnected() and auth.is_still_authorized(request, Scope.READ):
         try:
             digest = await run_sync(overview.fingerprint)
         except UnavailableError as error:
@@ -87,33 +87,32 @@ class Webhooks:
     def __init__(self, services: Services) -> None:
         self._services = services
 
-    def end_events(self, since: int, *, limit: int) -> list[EndView]:
-        return self._services.index.outbox.end_events(since, limit=limit, scope=project_scope())
+    end_events = auth.InScope(lambda index: index.outbox.end_events)
 
     def own_ends(self, since: int, *, limit: int) -> list[tuple[EndView, str]]:
-        return self._services.index.outbox.own_ends(caller_id(), since, limit=limit, scope=project_scope())
+        return self._services.index.outbox.own_ends(auth.caller_id(), since, limit=limit, scope=auth.project_scope())
 
     def add(self, url: str, states: tuple[End, ...]) -> tuple[WebhookView, str]:
         """Add a webhook; return it with its secret, which cannot be shown again."""
         master = self._services.settings.webhook_secret
         if master is None:
             raise ConflictError("webhooks are off; the operator can set GRASPD_WEBHOOK_SECRET for API and controller")
-        project, states = project_scope().project, tuple(dict.fromkeys(states))
-        about = {"created": timestamp(), "owner": caller_id(), "project": project}
+        project, states = auth.project_scope().project, tuple(dict.fromkeys(states))
+        about = {"created": timestamp(), "owner": auth.caller_id(), "project": project}
         hook = Webhook(id=secrets.token_hex(16), url=check_url(url), states=states, **about)
         with record_transaction(self._services) as (connection, put):
             if len(self._services.index.outbox.webhooks(scope=ProjectScope(project, everything=False))) >= MOST_HOOKS:
                 raise LimitError(f"there are {MOST_HOOKS} webhooks already, the maximum; delete one")
             put(names.webhook_key(hook.id), hook)
             self._services.index.outbox.add(hook, within=connection)
-        key = caller.get()
+        key = auth.caller.get()
         log.info("webhook %s made by %s", hook.id, key.name if key else "this machine")
         return self._services.index.outbox.webhook(hook.id), derive_secret(master.get_secret_value(), hook.id)
 
     def all(self) -> list[WebhookView]:
         """Return only webhooks that the caller may change, because their addresses may contain credentials."""
-        hooks = self._services.index.outbox.webhooks(scope=project_scope())
-        return [hook for hook in hooks if may_change(hook.owner, hook.project)]
+        hooks = self._services.index.outbox.webhooks(scope=auth.project_scope())
+        return [hook for hook in hooks if auth.may_change(hook.owner, hook.project)]
 
     def deliveries(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
         return self._services.index.outbox.delivery_log(self._get_owned(webhook).id, limit=limit)
@@ -126,6 +125,6 @@ class Webhooks:
         log.info("webhook %s deleted", hook.id)
 
     def _get_owned(self, webhook: str) -> WebhookView:
-        hook = self._services.index.outbox.webhook(webhook, scope=project_scope())
-        require_ownership(hook.owner, f"webhook {webhook}", hook.project)
+        hook = self._services.index.outbox.webhook(webhook, scope=auth.project_scope())
+        auth.require_ownership(hook.owner, f"webhook {webhook}", hook.project)
         return hook

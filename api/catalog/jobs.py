@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from pydantic import ValidationError
 
-from graspd.api.access.auth import ForeignResource, caller, caller_id, project_scope, require_ownership
+from graspd.api.access.auth import ForeignResource, InScope, caller, caller_id, project_scope, require_ownership
 from graspd.api.access.quotas import Idempotency, Quotas
 from graspd.api.catalog.grasps import Grasps
 from graspd.api.models import Job, JobDetail, MeanMetrics, Shard, StageStatus, stage_state
@@ -26,7 +26,6 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.spec import Estimate, Matrix
 from graspd.service.queue.port import rq_id
-from graspd.service.store.columns import ShardKind
 from graspd.service.store.integrity import CheckedObjects, read_checked
 from graspd.service.store.manifests import load_manifest
 from graspd.service.store.records import task_attempts
@@ -49,10 +48,9 @@ class Shards:
         self._services = services
         self._checked = CheckedObjects(services.store)
 
-    def page(
-        self, *, job: str | None = None, kind: ShardKind | None = None, limit: int = 50, cursor: str | None = None
-    ) -> Page[Shard]:
-        page = self._services.index.shards.page(job=job, kind=kind, limit=limit, cursor=cursor, scope=project_scope())
+    def page(self, **wanted: Any) -> Page[Shard]:
+        """Return a page of shards; `wanted` has the filters and the paging of the index."""
+        page = self._services.index.shards.page(**wanted, scope=project_scope())
         return Page[Shard](items=[_shard_model(shard) for shard in page.items], next=page.next)
 
     def get(self, shard_id: str) -> Shard:
@@ -75,6 +73,8 @@ class Shards:
         """Yield bytes of the file in chunks; DamagedShard if they changed since the check of the file."""
         return self._checked.stream(shard.key, shard.sha256, start, length)
 
+    job_of = InScope(lambda index: index.shards.job_of)
+
     def film(self, shard_id: str, row: int, camera: str) -> bytes:
         """Return the video of a grasp's episode; NotFoundError if it was not executed or not filmed."""
         shard = self.get(shard_id)
@@ -84,9 +84,6 @@ class Shards:
                 if film := file[f"video/{camera}"][ends[place - 1] if place else 0 : ends[place]].tobytes():
                     return bytes(film)
         raise errors.NotFoundError(f"shard {shard_id} has no film of grasp {row} by a camera {camera!r}")
-
-    def job_of(self, shard_id: str) -> str | None:
-        return self._services.index.shards.job_of(shard_id, scope=project_scope())
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
         return self._services.index.shards.assets_of(ids)
@@ -144,20 +141,9 @@ class Jobs:
             deletion.delete_job(self._services, job_id, owner=caller_id())
             log.info("job deleted")
 
-    def page(
-        self,
-        *,
-        state: State | None = None,
-        hand: str | None = None,
-        object: str | None = None,
-        prefix: str = "",
-        limit: int = 50,
-        cursor: str | None = None,
-        **order: Any,
-    ) -> Page[Job]:
-        """Return a page of jobs; `order` has `words`, `sort` and `descending` of the index."""
-        wanted = {"state": state, "hand": hand, "object": object, "prefix": prefix, **order}
-        page = self._services.index.jobs.page(**wanted, limit=limit, cursor=cursor, scope=project_scope())
+    def page(self, **wanted: Any) -> Page[Job]:
+        """Return a page of jobs; `wanted` has the filters, the order and the paging of the index."""
+        page = self._services.index.jobs.page(**wanted, scope=project_scope())
         return Page[Job](items=[self._job_model(job, ()) for job in page.items], next=page.next)
 
     def get(self, job_id: str) -> JobDetail:

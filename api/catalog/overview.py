@@ -13,14 +13,14 @@ from urllib.parse import quote
 
 from pydantic import Field
 
-from graspd.api.access.auth import caller, project_scope, require_ownership
+from graspd.api.access.auth import InScope, caller, project_scope, require_ownership
 from graspd.api.access.keys import KeyFile, ProjectLimits
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.metrics import MetricsSnapshot
 from graspd.api.models import STAGE_LABELS, Health, Part, Worker
 from graspd.service.index.notes import Damage
 from graspd.service.index.queries.overview import read_index_status
-from graspd.service.index.views import FailureGroup, Stats, TaskView, UsageDay, View
+from graspd.service.index.views import FailureGroup, TaskView, UsageDay, View
 from graspd.service.model import errors
 from graspd.service.model.digests import digest_json
 from graspd.service.model.projects import ProjectScope
@@ -84,8 +84,7 @@ class Overview:
         pages = {"tag": "/grasps?tag=", "network": "/hands?network="}
         return [(kind, name, pages.get(kind, f"/{kind}s/") + quote(name)) for kind, name in names]
 
-    def stats(self) -> Stats:
-        return self._services.index.overview.stats(scope=project_scope())
+    stats = InScope(lambda index: index.overview.stats)
 
     def valid_per_minute(self) -> dict[str, int]:
         """Return numbers of valid grasps in each of the last `MINUTES`, by minute (UTC), oldest first."""

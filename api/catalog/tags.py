@@ -5,7 +5,7 @@ import io
 import json
 import logging
 import zipfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import PurePosixPath
@@ -14,7 +14,7 @@ from typing import IO, Any, Final, Literal
 
 import numpy as np
 
-from graspd.api.access.auth import caller_id, may_change, project_scope, require_ownership
+from graspd.api.access.auth import InScope, caller_id, may_change, project_scope, require_ownership
 from graspd.api.catalog.grasps import Grasps
 from graspd.api.models import Selection, TagChange
 from graspd.service.index.views import GraspView, TagView
@@ -36,16 +36,12 @@ class Tags:
         self._services = services
         self._grasps = grasps
 
-    def all(self) -> list[TagView]:
-        return self._services.index.tags.all(scope=project_scope())
+    all = InScope(lambda index: index.tags.all)
+    names_by_grasp = InScope(lambda index: index.tags.names_by_grasp)
 
     def get(self, name: str) -> TagView:
         wanted = self._services.index.tags.id_of(name, scope=project_scope())
         return next(tag for tag in self.all() if tag.id == wanted)
-
-    def names_by_grasp(self, grasps: Collection[Grasp]) -> dict[Grasp, list[str]]:
-        """Return the names of the tags of the given grasps; grasps without tags are omitted."""
-        return self._services.index.tags.names_by_grasp(grasps, scope=project_scope())
 
     def resolve_selection(self, selection: Selection) -> list[Grasp]:
         """Return the grasps of a selection, each once; raise NotFoundError if one is out of scope."""

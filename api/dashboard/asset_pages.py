@@ -19,7 +19,7 @@ from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.asset_summary import hand_line, payload_line, self_test_line
 from graspd.service.store.assets import BUILTIN_LICENCE
-from graspd.service.store.descriptions import MAX_ENTRIES, HandFacts
+from graspd.service.store.descriptions import MAX_ENTRIES, HandFacts, read_document
 
 PAGE_SIZE: Final = 50
 _CHECK_S: Final = 2
@@ -48,7 +48,6 @@ def _render_list(request: Request, assets: Assets, kind: AssetKind, cursor: str 
     return render(
         request,
         "assets.html",
-        page=f"/{kind.value}s",
         poll_s=2 * _CHECK_S,
         kind=kind.value,
         assets=[(one, _short_facts(assets, one)) for one in page.items],
@@ -62,8 +61,8 @@ def _render_list(request: Request, assets: Assets, kind: AssetKind, cursor: str 
 def _short_facts(assets: Assets, asset: AssetView) -> list[tuple[str, str]]:
     """Return labels and texts. `facts` contains data from the upload, so values may be of any type."""
     facts = asset.facts
-    if asset.builtin and asset.kind is AssetKind.HAND:
-        facts = _builtin_facts(assets, asset.digest) | facts
+    if asset.builtin:
+        facts = _builtin_facts(assets, asset.kind, asset.digest) | facts
     rows = [(label, str(len(one))) for name, label in _COUNTED if isinstance(one := facts.get(name), list)]
     if isinstance(opening := facts.get("opening_m"), int | float):
         rows.append(("Opening", f"{1e3 * opening:.0f} mm"))
@@ -76,10 +75,13 @@ def _short_facts(assets: Assets, asset: AssetView) -> list[tuple[str, str]]:
 
 
 @lru_cache(maxsize=16)
-def _builtin_facts(assets: Assets, digest: str) -> dict[str, Any]:
-    """Return the facts of a built-in hand from its model, because it has no check."""
+def _builtin_facts(assets: Assets, kind: AssetKind, digest: str) -> dict[str, Any]:
+    """Return the facts of a built-in hand or object from its model, because it has no check."""
     with suppress(NotFoundError, ConflictError):
-        return assets.hand_facts(assets.get(AssetKind.HAND, digest)).model_dump()
+        asset = assets.get(kind, digest)
+        if kind is AssetKind.HAND:
+            return assets.hand_facts(asset).model_dump()
+        return dict(read_document(assets.model(asset))["asset"]["extras"])
     return {}
 
 
@@ -90,7 +92,6 @@ def object_page(request: Request, name: str, assets: AssetsOf) -> HTMLResponse:
     return render(
         request,
         "object.html",
-        page="/objects",
         poll_s=0 if checked else _CHECK_S,
         object=found,
         checked=checked,
@@ -135,7 +136,6 @@ def _render_hand(
         request,
         "hand.html",
         status=status,
-        page="/hands",
         poll_s=_CHECK_S if waits else 0,
         hand=hand,
         facts=facts,

@@ -80,7 +80,6 @@ def dataset_page(
     return render(
         request,
         "dataset.html",
-        page="/datasets",
         events="" if dataset.state.is_final else "/events",
         refresh_s=0 if dataset.state.is_final else 5,
         dataset=dataset,
@@ -138,7 +137,6 @@ def _render_datasets(
         request,
         "datasets.html",
         status=status,
-        page="/datasets",
         events="/events",
         refresh_s=10,
         datasets=page.items,

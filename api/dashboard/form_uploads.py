@@ -22,7 +22,7 @@ from graspd.service.store.assets import asset_json
 from graspd.service.store.descriptions import parse_json_object
 
 _CHECK_WAIT_S: Final = 15.0
-UNITS: Final = (("m", "metres"), ("mm", "millimetres"), ("cm", "centimetres"), ("in", "inches"))
+UNITS: Final = {"m": "metres", "mm": "millimetres", "cm": "centimetres", "in": "inches"}
 #: Text of each button, by the option that the button sets.
 _FIXES: Final = {
     "rigid": "Take the parts as one rigid body",
@@ -51,56 +51,57 @@ class Fix:
 
 
 @dataclass(frozen=True)
-class Refusal:
-    """Reason why a file cannot be used, as texts for a page."""
-
-    problem: str
-    fixes: tuple[Fix, ...] = ()
-
-
-@dataclass(frozen=True)
 class AssetChoice:
     name: str = ""
     """Name of the job's asset; empty until one is chosen."""
-    refused: Refusal | None = None
+    problem: str = ""
+    """Reason why there is none, for a page."""
+    fixes: tuple[Fix, ...] = ()
     file: str = ""
     held: str = ""
-    """Digest of the refused file in the store; if empty, the user must choose the file again."""
+    """Digest of the file in the store; if empty, the user must choose the file again."""
+    message: str = ""
+    """Result of the check of an accepted file."""
+    shown_in: str = ""
+    """Unit in which the 3D view shows a refused file; empty: there is no view."""
 
     def form_field(self, kind: AssetKind) -> str:
         return FILE_FIELDS[kind] if self.file else kind.value
 
 
 def choose_asset(request: Request, assets: Assets, fields: FormData, kind: AssetKind) -> AssetChoice:
-    """Return the hand or object of a submitted form: an uploaded file, a known asset, or the refused file."""
+    """Return the hand or object of a submitted form: an uploaded file, the file that the form refers to, or a known
+    asset."""
     file, known = fields.get(FILE_FIELDS[kind]), _field_text(fields, kind.value)
     if isinstance(file, UploadFile) and file.filename:
         try:
             asset = _store_upload(request, assets, kind, file, _chosen_unit(fields))
         except InputError as error:
-            return AssetChoice(refused=Refusal(str(error)), file=file.filename)
+            return AssetChoice(problem=str(error), file=file.filename)
         return _wait_for_check(assets, asset)
-    if known:
-        return AssetChoice(name=known)
     if held := _field_text(fields, f"{kind.value}_held"):
         try:
-            return _wait_for_check(assets, _retry_upload(assets, kind, held, fields))
+            before = assets.get(kind, held)
+            if known in ("", before.name):
+                return _wait_for_check(assets, _retry_upload(assets, before, fields))
         except InputError as error:
-            return AssetChoice(refused=Refusal(str(error)), file=held, held=held)
-    return AssetChoice(refused=Refusal(f"select a known {kind.value}, or a file"))
+            return AssetChoice(problem=str(error), file=held, held=held)
+    if known:
+        return AssetChoice(name=known)
+    return AssetChoice(problem=f"select a known {kind.value}, or a file")
 
 
-def refusal_of(asset: AssetView) -> Refusal:
-    """Return an asset's refusal. Values in `facts` may come from the upload, so their type is checked."""
+def _refused(asset: AssetView) -> AssetChoice:
+    """Return a refused file. Values in `facts` may come from the upload, so their type is checked."""
     facts = asset.facts
-    lengths = facts.get("lengths_m")
-    units = [
-        Fix(json.dumps({"units": unit}), f"Read in {words}" + _length(lengths, unit))
-        for unit in _list_entries(facts, "units_suggested")
-        if isinstance(unit, str) and (words := dict(UNITS).get(unit))
+    units = [unit for unit in _list_entries(facts, "units_suggested") if isinstance(unit, str) and unit in UNITS]
+    fixes = [
+        Fix(json.dumps({"units": unit}), f"Read in {UNITS[unit]}" + _length(facts.get("lengths_m"), unit))
+        for unit in units
     ]
     others = [fix for one in _list_entries(facts, "options_suggested") if isinstance(one, dict) and (fix := _fix(one))]
-    return Refusal(str(facts.get("problem") or asset.message or "refused"), (*units, *others))
+    problem, shown_in = str(facts.get("problem") or asset.message or "refused"), UNITS[units[0]] if units else ""
+    return AssetChoice("", problem, (*fixes, *others), asset.name, asset.digest, shown_in=shown_in)
 
 
 def _list_entries(facts: Mapping[str, Any], key: str) -> list[Any]:
@@ -136,11 +137,12 @@ def _store_upload(request: Request, assets: Assets, kind: AssetKind, file: Uploa
     return store_upload(assets, kind, file, None, limit_bytes=limit, options=options, rename=True)
 
 
-def _retry_upload(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
-    """Store the refused file again, with the options of the pressed button or with changed units."""
-    before, said = assets.get(kind, digest), fix_options(fields, kind)
-    if not said and kind is AssetKind.OBJECT and (units := _chosen_unit(fields)) != _field_text(fields, "held_units"):
-        said = {"units": units}
+def _retry_upload(assets: Assets, before: AssetView, fields: FormData) -> AssetView:
+    """Store the file again, with the options of the pressed button or with changed units."""
+    kind = before.kind
+    if not (said := fix_options(fields, kind)) and kind is AssetKind.OBJECT:
+        units = _chosen_unit(fields)
+        said = {"units": units} if units != _field_text(fields, "held_units") else {}
     if not said:
         return before
     files = assets.files(before)
@@ -172,14 +174,15 @@ def _wait_for_check(assets: Assets, asset: AssetView) -> AssetChoice:
         time.sleep(0.2)
         asset = assets.get(asset.kind, asset.digest)
     if asset.verdict == "refuse":
-        return AssetChoice(refused=refusal_of(asset), file=asset.name, held=asset.digest)
-    return AssetChoice(name=asset.name)
+        return _refused(asset)
+    unchecked = "No worker has checked it yet; start one before you submit."
+    return AssetChoice(asset.name, held=asset.digest, message=(asset.message or "") if asset.verdict else unchecked)
 
 
 def select_choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> list[tuple[str, str]]:
     """Return names with their labels, including the name or the refused file that the form shows."""
     known = asset_choices(assets, kind)
-    if one.refused:
+    if one.problem:
         return [("", f"your file {one.file} (refused)" if one.file else f"select a {kind.value}"), *known]
     if shown not in dict(known):
         return [(shown, f"{shown} (unknown)" if shown else f"select a {kind.value}"), *known]
@@ -200,6 +203,12 @@ def _field_text(fields: FormData, name: str) -> str:
     return value if isinstance(value := fields.get(name), str) else ""
 
 
+def shown_unit(fields: FormData) -> str:
+    """Return the unit of the pressed button, else the chosen one."""
+    fix = _field_text(fields, f"{AssetKind.OBJECT.value}_fix")
+    return next((unit for unit in UNITS if fix == json.dumps({"units": unit})), _chosen_unit(fields))
+
+
 def _chosen_unit(fields: FormData) -> str:
     units = _field_text(fields, "units")
-    return units if units in dict(UNITS) else "m"
+    return units if units in UNITS else "m"

@@ -19,7 +19,7 @@ from starlette.datastructures import FormData, UploadFile
 from graspd.api.access.auth import project_scope
 from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.jobs import Jobs
-from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, AssetChoice, choose_asset, refusal_of, select_choices
+from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, AssetChoice, choose_asset, select_choices, shown_unit
 from graspd.api.dashboard.rendering import redirect, render
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, JobsOf
 from graspd.service.command_options import parse_pairs
@@ -96,12 +96,6 @@ def submit_page(request: Request, assets: AssetsOf) -> HTMLResponse:
     return _render_form(request, assets, DEFAULTS | given)
 
 
-@router.get("/submit/refusals/{kind}/{digest}", dependencies=READ)
-def refusal_page(request: Request, kind: AssetKind, digest: str, assets: AssetsOf) -> HTMLResponse:
-    found = refusal_of(assets.get(kind, digest))
-    return render(request, "refusal.html", kind=kind.value, problem=found.problem, fixes=found.fixes)
-
-
 @router.post("/submit", dependencies=SUBMIT, response_model=None)
 async def submit(request: Request, jobs: JobsOf, assets: AssetsOf) -> HTMLResponse | RedirectResponse:
     async with request.form(max_files=2, max_fields=64) as fields:
@@ -131,11 +125,11 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
     form |= {one.name: fields.get(one.name) == "true" for one in INPUTS if one.kind == "checkbox"}
     things = {kind: choose_asset(request, assets, fields, kind) for kind in FILE_FIELDS}
     form |= {kind.value: one.name for kind, one in things.items()}
-    shown = DEFAULTS | form | {"units": fields.get("units") or "m"}
-    refused = {one.form_field(kind): one.refused.problem for kind, one in things.items() if one.refused}
+    shown = DEFAULTS | form | {"units": shown_unit(fields)}
+    refused = {one.form_field(kind): one.problem for kind, one in things.items() if one.problem}
     if any(fields.get(f"{kind.value}_fix") for kind in FILE_FIELDS):
-        # The button of a fix only shows its result; the submit button submits.
-        return _render_form(request, assets, shown, things=things, errors=refused, status=422 if refused else 200)
+        # A chosen file or the button of a fix only shows its result; the submit button submits.
+        return _render_form(request, assets, shown, things=things, errors=refused)
     started = timestamp()
     try:
         named = {kind.value: one.name or "unnamed" for kind, one in things.items()}
@@ -192,7 +186,6 @@ def _render_form(
         request,
         "submit.html",
         status=status,
-        page="/submit",
         form={"units": "m"} | form,
         errors=(errors := dict.fromkeys([*DEFAULTS, "file", "hand_file"], "") | (errors or {})),
         problem=problem,
@@ -202,8 +195,7 @@ def _render_form(
         opened=any(errors[one.name] or str(form[one.name]) != str(one.default) for one in INPUTS if one.group),
         hands=select_choices(assets, AssetKind.HAND, str(form["hand"]), things[AssetKind.HAND]),
         objects=select_choices(assets, AssetKind.OBJECT, str(form["object"]), things[AssetKind.OBJECT]),
-        held={kind.value: one.held for kind, one in things.items()},
-        fixes={kind.value: one.refused.fixes if one.refused else () for kind, one in things.items()},
+        things={kind.value: one for kind, one in things.items()},
         cost=request.app.state.expectations.estimate(form),
         units=UNITS,
         snippet=_snippet(form),

@@ -72,7 +72,6 @@ def grasps_page(request: Request, grasps: GraspsOf, shards: ShardsOf, tags: Tags
         request,
         "grasps.html",
         status=422 if problem else 200,
-        page="/grasps",
         query=query,
         given=shown,
         facets=facets,
@@ -151,7 +150,6 @@ def compare_page(request: Request, grasps: GraspsOf, g: Annotated[str, Query(max
     return render(
         request,
         "grasp_compare.html",
-        page="/grasps",
         grasps=[grasps.get_short(name) for name in g.split(",")[:MOST_COMPARED]],
         metrics=indexed_metrics(),
     )
@@ -165,7 +163,6 @@ def grasp_page(
     return render(
         request,
         "grasp.html",
-        page="/grasps",
         grasp=grasp,
         tags=[tag.name for tag in tags.all()],
         tagged=tags.names_by_grasp([(shard_id, row)]),

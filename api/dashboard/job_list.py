@@ -44,7 +44,6 @@ def jobs_page(request: Request, jobs: JobsOf) -> HTMLResponse | RedirectResponse
     return render(
         request,
         "jobs.html",
-        page="/jobs",
         events="/events",
         refresh_s=5,
         jobs=page.items,

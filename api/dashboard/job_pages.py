@@ -32,7 +32,17 @@ router = APIRouter(include_in_schema=False)
 @router.get("/jobs/{job_id}", dependencies=READ)
 def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags: TagsOf) -> HTMLResponse:
     job = jobs.get(job_id)
-    pictures = _list_pictures(job)
+    eyes = ("left", "right") if job.request.stereo else ("",)
+    pictures = [
+        {
+            "address": f"/shards/{shard.id}/pictures/{index}.png",
+            "label": f"View {index // len(eyes) + 1} {eyes[index % len(eyes)]}".strip(),
+            "shard": shard.id,
+        }
+        for shard in job.shards
+        if shard.kind == "views"
+        for index in range(shard.count)
+    ]
     shown = {key: (label, unit) for key, label, unit in COLUMNS}
     validated = job.request.validation != "none"
     query = GraspQuery(job=job_id, valid=True if validated else None)
@@ -41,7 +51,6 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
     return render(
         request,
         "job.html",
-        page="/jobs",
         events="" if job.state.is_final else f"/v1/jobs/{job.id}/events",
         refresh_s=0 if job.state.is_final else 3,
         job=job,
@@ -76,7 +85,6 @@ def task_page(request: Request, job_id: str, task_id: str, jobs: JobsOf) -> HTML
     return render(
         request,
         "task.html",
-        page="/jobs",
         events="" if ended else f"/v1/jobs/{job.id}/events",
         refresh_s=0 if ended else 3,
         job=job,
@@ -110,21 +118,6 @@ def picture(
     shard = shards.get(shard_id)
     data = request.app.state.pictures.png(shard.key, shard.sha256, index, channel, width)
     return Response(data, media_type="image/png", headers={"Cache-Control": "private, max-age=86400, immutable"})
-
-
-def _list_pictures(job: JobDetail) -> list[dict[str, Any]]:
-    """List all rendered pictures; the left one of a stereo pair comes first."""
-    eyes = ("left", "right") if job.request.stereo else ("",)
-    return [
-        {
-            "address": f"/shards/{shard.id}/pictures/{index}.png",
-            "label": f"View {index // len(eyes) + 1} {eyes[index % len(eyes)]}".strip(),
-            "shard": shard.id,
-        }
-        for shard in job.shards
-        if shard.kind == "views"
-        for index in range(shard.count)
-    ]
 
 
 #: Number of cached shards, of a few megabytes each; a page requests several pictures of a shard.

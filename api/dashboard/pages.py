@@ -45,7 +45,6 @@ def home(
     return render(
         request,
         "home.html",
-        page="/",
         events="/events",
         refresh_s=5,
         stats=overview.stats(),
@@ -66,7 +65,6 @@ def workers_page(request: Request, overview: dependencies.OverviewOf, jobs: depe
     return render(
         request,
         "workers.html",
-        page="/workers",
         events="/events",
         refresh_s=5,
         workers=workers,
@@ -170,7 +168,6 @@ def _render_notifications(request: Request, webhooks: Webhooks, *, status: int =
     page = render(
         request,
         "notifications.html",
-        page="/notifications",
         status=status,
         **{"problem": "", "url": "", "secret": ""} | shown,
         ends=ends,
@@ -207,7 +204,6 @@ def usage_page(request: Request, usage: dependencies.UsageOf, since: Since = Non
     return render(
         request,
         "usage.html",
-        page="/usage",
         poll_s=30,
         days=days,
         totals=[(name, totals[name], limits.get(name)) for name in sorted(totals)],
@@ -272,15 +268,8 @@ def _redirect_to_deletions(id: str) -> RedirectResponse:
 
 
 routers: Final = (
-    router,
-    job_list.search_router,
-    job_list.router,
-    job_pages.router,
-    grasp_pages.router,
-    asset_pages.router,
-    dataset_pages.router,
-    dataset_pages.comparison_router,
-    forms.router,
+    *(router, job_list.search_router, job_list.router, job_pages.router, grasp_pages.router, asset_pages.router),
+    *(dataset_pages.router, dataset_pages.comparison_router, forms.router),
 )
 
 

@@ -17,17 +17,9 @@ from graspd.service.model.version import PACKAGE_VERSION
 
 _HERE: Final = Path(__file__).parent
 STATIC: Final = _HERE / "static"
-NAVIGATION: Final = (
-    ("/", "Home"),
-    ("/jobs", "Jobs"),
-    ("/datasets", "Datasets"),
-    ("/grasps", "Grasps"),
-    ("/hands", "Hands"),
-    ("/objects", "Objects"),
-    ("/workers", "Workers"),
-    ("/usage", "Usage"),
-    ("/engine", "Engine"),
-)
+#: Pages with keyboard shortcuts, their first letters; then all pages of the navigation.
+_WITH_KEYS: Final = ("jobs", "datasets", "grasps", "hands", "objects", "workers")
+NAVIGATION: Final = (("/", "Home"), *((f"/{name}", name.capitalize()) for name in (*_WITH_KEYS, "usage", "engine")))
 #: Cookie with a message for the next page.
 _TOAST: Final = "graspd_toast"
 #: Parameters of pages that the API does not have.
@@ -36,7 +28,7 @@ _NO_FILTERS: Final = ("view", "cursor", "done")
 SEEN: Final = "graspd_seen"
 MOST_UNREAD: Final = 100
 #: Keyboard shortcuts of pages.
-KEYS: Final = {f"/{page}": page[0] for page in ("jobs", "datasets", "grasps", "hands", "objects", "workers")}
+KEYS: Final = {f"/{page}": page[0] for page in _WITH_KEYS}
 
 
 def environment() -> Environment:
@@ -53,8 +45,12 @@ def environment() -> Environment:
 
 
 def render(request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
-    """Render a page; `page` is its navigation entry, `events` its update stream, `poll_s` an interval [s]."""
-    defaults = {"page": "", "events": "", "refresh_s": 0, "poll_s": 0, "health": request.app.state.overview.health()}
+    """Render a page; `page` is its navigation entry, by default the first part of its path.
+
+    `events` is its update stream, `poll_s` an interval [s].
+    """
+    page = f"/{request.url.path.split('/')[1]}"
+    defaults = {"page": page, "events": "", "refresh_s": 0, "poll_s": 0, "health": request.app.state.overview.health()}
     context = defaults | context
     may_read = is_allowed(request, Scope.READ)
     has_bell = may_read and context["health"] is not None and context["health"].parts["index"].latency_ms is not None
@@ -106,4 +102,4 @@ def base_url(request: Request) -> str:
 def problem_page(request: Request, problem: dict[str, Any]) -> Response:
     if problem["status"] == 401:
         return RedirectResponse("/login", status_code=303)
-    return render(request, "problem.html", status=problem["status"], problem=problem, health=None)
+    return render(request, "problem.html", status=problem["status"], page="", problem=problem, health=None)

@@ -12,16 +12,7 @@ from pydantic import Field
 from starlette.datastructures import UploadFile as AnyUpload
 
 from graspd.api.catalog.assets import Assets
-from graspd.api.routes.dependencies import (
-    READ,
-    SUBMIT,
-    UNCHANGED,
-    UPLOADS,
-    AssetsOf,
-    PagingOf,
-    RequestLimiter,
-    is_unmodified,
-)
+from graspd.api.routes import dependencies
 from graspd.api.uploads import files_of_upload, name_of_upload
 from graspd.service.index.views import AssetView, Page
 from graspd.service.model.base import Name
@@ -31,7 +22,7 @@ from graspd.service.store.descriptions import HandCorrections
 
 _GLB: Final = "model/gltf-binary"
 #: Most uploads unpacked and packed at once in this process; each may need memory for one of its files.
-_AT_ONCE: Final = BoundedSemaphore(UPLOADS)
+_AT_ONCE: Final = BoundedSemaphore(dependencies.UPLOADS)
 _TURN_S: Final = 20.0
 
 _ZIPPED: Final = "Upload a file, or a ZIP of its folder. A worker checks the asset before a job uses it."
@@ -42,17 +33,17 @@ _NETWORK: Final = "Upload a proposal network: an `.npz` of the schema `graspd/pr
 def asset_router(kind: AssetKind) -> APIRouter:
     router = APIRouter(prefix=f"/v1/{kind.value}s", tags=[f"{kind.value}s"])
 
-    @router.get("", dependencies=READ, name=f"list_{kind}s")
+    @router.get("", dependencies=dependencies.READ, name=f"list_{kind}s")
     def list_assets(
-        assets: AssetsOf,
-        paging: PagingOf,
+        assets: dependencies.AssetsOf,
+        paging: dependencies.PagingOf,
         refused: Annotated[bool, Query(description="include assets that the check refused")] = False,
     ) -> Page[AssetView]:
         """List all assets of this kind, newest first; refused ones only on request."""
         return paging.add_next_link(assets.page(kind, limit=paging.limit, cursor=paging.cursor, refused=refused))
 
-    @router.get("/{name}", dependencies=READ, name=f"get_{kind}")
-    def get_asset(name: str, assets: AssetsOf) -> AssetView:
+    @router.get("/{name}", dependencies=dependencies.READ, name=f"get_{kind}")
+    def get_asset(name: str, assets: dependencies.AssetsOf) -> AssetView:
         """Return an asset with the findings of its check."""
         return assets.get(kind, name)
 
@@ -62,7 +53,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
     @router.post(
         "",
         status_code=201 if kind is AssetKind.NETWORK else 202,
-        dependencies=SUBMIT,
+        dependencies=dependencies.SUBMIT,
         name=f"add_{kind}",
         description=_NETWORK if kind is AssetKind.NETWORK else _ZIPPED,
     )
@@ -70,14 +61,14 @@ def asset_router(kind: AssetKind) -> APIRouter:
         file: UploadFile,
         response: Response,
         request: Request,
-        assets: AssetsOf,
+        assets: dependencies.AssetsOf,
         name: Annotated[Name | None, Form()] = None,
         options: Annotated[str, Form(description='JSON of asset.json keys: {"units": "mm"}', max_length=65536)] = "",
         self_test: Annotated[bool, Form(description="hands only: run the self-test, for some minutes")] = False,
         shared: Annotated[bool, Form(description="whether all projects may use it, not only the key's")] = False,
         rename: Annotated[bool, Form(description="use the next free name if the name is taken")] = False,
     ) -> AssetView:
-        uploads: RequestLimiter = request.app.state.uploads
+        uploads: dependencies.RequestLimiter = request.app.state.uploads
         if self_test and kind is not AssetKind.HAND:
             raise InputError("self_test: only hands have a self-test")
         said = {"options": options, "self_test": self_test, "shared": shared, "rename": rename}
@@ -88,8 +79,8 @@ def asset_router(kind: AssetKind) -> APIRouter:
             response.headers["Retry-After"] = "1"
         return asset
 
-    @router.delete("/{name}", status_code=204, dependencies=SUBMIT, name=f"delete_{kind}")
-    def delete_asset(name: str, assets: AssetsOf) -> None:
+    @router.delete("/{name}", status_code=204, dependencies=dependencies.SUBMIT, name=f"delete_{kind}")
+    def delete_asset(name: str, assets: dependencies.AssetsOf) -> None:
         """Delete an asset; refused while a job, dataset or set of objects needs it. `name` may be a digest."""
         assets.delete(kind, name)
 
@@ -99,19 +90,22 @@ def asset_router(kind: AssetKind) -> APIRouter:
 def _add_model_route(router: APIRouter, kind: AssetKind) -> None:
     @router.get(
         "/{name}/model",
-        dependencies=READ,
+        dependencies=dependencies.READ,
         response_class=Response,
-        responses={200: {"content": {_GLB: {}}, "description": "Binary glTF"}, 304: {"description": UNCHANGED}},
+        responses={
+            200: {"content": {_GLB: {}}, "description": "Binary glTF"},
+            304: {"description": dependencies.UNCHANGED},
+        },
         name=f"get_{kind}_model",
     )
-    def get_model(name: str, request: Request, assets: AssetsOf) -> Response:
+    def get_model(name: str, request: Request, assets: dependencies.AssetsOf) -> Response:
         """Return the prepared hand (with its joint tree) or object, in metres; `name` may be a digest."""
         asset = assets.get(kind, name)
         # Content under a digest never changes; a name may later refer to another asset.
         lasting = "private, max-age=31536000, immutable" if name == asset.digest else "no-cache"
         data = assets.model(asset)
         headers = {"ETag": f'"{hashlib.sha256(data).hexdigest()}"', "Cache-Control": lasting}
-        if is_unmodified(request.headers, headers["ETag"]):
+        if dependencies.is_unmodified(request.headers, headers["ETag"]):
             return Response(status_code=304, headers=headers)
         return Response(data, media_type=_GLB, headers=headers)
 
@@ -158,12 +152,12 @@ class CorrectionRequest(HandCorrections):
     name: Name | None = Field(None, description="name of the corrected hand; default: the hand's name with a number")
 
 
-@correction_router.post("/{name}/corrections", status_code=202, dependencies=SUBMIT)
+@correction_router.post("/{name}/corrections", status_code=202, dependencies=dependencies.SUBMIT)
 async def correct_hand(
-    name: str, body: CorrectionRequest, request: Request, response: Response, assets: AssetsOf
+    name: str, body: CorrectionRequest, request: Request, response: Response, assets: dependencies.AssetsOf
 ) -> AssetView:
     """Create a hand from the same files with corrections; a worker checks it. `name` may be a digest."""
-    uploads: RequestLimiter = request.app.state.uploads
+    uploads: dependencies.RequestLimiter = request.app.state.uploads
     asset = await uploads.run(store_correction, assets, name, body, body.name)
     response.headers["Location"] = f"/v1/hands/{asset.name}"
     response.headers["Retry-After"] = "1"

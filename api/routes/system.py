@@ -15,16 +15,7 @@ from graspd.api.catalog import events
 from graspd.api.catalog.overview import DeletionView, usage_csv
 from graspd.api.metrics import CONTENT_TYPE, Metrics
 from graspd.api.models import Health, Worker
-from graspd.api.routes.dependencies import (
-    READ,
-    SUBMIT,
-    DeletionsOf,
-    Limit,
-    OverviewOf,
-    UsageOf,
-    WebhooksOf,
-    require_metrics_access,
-)
+from graspd.api.routes import dependencies
 from graspd.service.index.views import DeliveryView, EndView, Stats, UsageDay, WebhookView
 from graspd.service.model.webhooks import MAX_URL, End
 from graspd.service.store.records import What
@@ -32,14 +23,14 @@ from graspd.service.store.records import What
 router = APIRouter(tags=["system"])
 
 
-@router.get("/v1/workers", dependencies=READ)
-def list_workers(overview: OverviewOf) -> list[Worker]:
+@router.get("/v1/workers", dependencies=dependencies.READ)
+def list_workers(overview: dependencies.OverviewOf) -> list[Worker]:
     """List workers with a recent heartbeat: device, present stage, age of the lease."""
     return overview.workers()
 
 
-@router.get("/v1/stats", dependencies=READ)
-def get_stats(overview: OverviewOf) -> Stats:
+@router.get("/v1/stats", dependencies=dependencies.READ)
+def get_stats(overview: dependencies.OverviewOf) -> Stats:
     """Return statistics of the whole service, from the index."""
     return overview.stats()
 
@@ -51,7 +42,7 @@ async def healthz() -> dict[str, bool]:
 
 
 @router.get("/readyz", responses={503: {"model": Health, "description": "A part does not answer"}})
-def readyz(request: Request, overview: OverviewOf, response: Response) -> Health:
+def readyz(request: Request, overview: dependencies.OverviewOf, response: Response) -> Health:
     """Return the latency of Redis, index and store, the controller's state, and the number of workers.
 
     Details of a fault are included only for callers that may read.
@@ -68,11 +59,11 @@ def readyz(request: Request, overview: OverviewOf, response: Response) -> Health
 
 @router.get(
     "/metrics",
-    dependencies=[Depends(require_metrics_access)],
+    dependencies=[Depends(dependencies.require_metrics_access)],
     response_class=Response,
     responses={200: {"content": {"text/plain": {}}}},
 )
-def metrics(request: Request, overview: OverviewOf) -> Response:
+def metrics(request: Request, overview: dependencies.OverviewOf) -> Response:
     """Return metrics as Prometheus text. If a part is down, only its series are missing."""
     values: Metrics = request.app.state.metrics
     return Response(values.render(overview.metrics_snapshot()), media_type=CONTENT_TYPE)
@@ -93,19 +84,19 @@ Since = Annotated[Day | None, Query(description="first day (UTC); default: 30 da
 Until = Annotated[Day | None, Query(description="last day (UTC); default: today")]
 
 
-@usage_router.get("/v1/usage", dependencies=READ)
-def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[UsageDay]:
+@usage_router.get("/v1/usage", dependencies=dependencies.READ)
+def get_usage(usage: dependencies.UsageOf, since: Since = None, until: Until = None) -> list[UsageDay]:
     """Return grasps and seconds per day of the key's project, newest first; with `admin`, of all projects."""
     return usage.days(since, until)
 
 
 @usage_router.get(
     "/v1/usage.csv",
-    dependencies=READ,
+    dependencies=dependencies.READ,
     response_class=Response,
     responses={200: {"content": {"text/csv": {}}, "description": "One line per day and project"}},
 )
-def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> Response:
+def get_usage_csv(usage: dependencies.UsageOf, since: Since = None, until: Until = None) -> Response:
     """Return the data of `/v1/usage` as CSV."""
     headers = {"Content-Disposition": 'attachment; filename="usage.csv"'}
     return Response(usage_csv(usage.days(since, until)), media_type="text/csv", headers=headers)
@@ -116,15 +107,15 @@ deletion_router = APIRouter(tags=["deletions"])
 Name = Annotated[str, Path(max_length=64, description="name or id of the resource")]
 
 
-@deletion_router.get("/v1/deletions", dependencies=READ)
-def list_deletions(deletions: DeletionsOf) -> list[DeletionView]:
+@deletion_router.get("/v1/deletions", dependencies=dependencies.READ)
+def list_deletions(deletions: dependencies.DeletionsOf) -> list[DeletionView]:
     """List deletions that can be undone, newest first."""
     return deletions.list_restorable()
 
 
 def _add_restore(what: What) -> None:
-    @deletion_router.post(f"/v1/{what}s/{{name}}/restore", dependencies=SUBMIT, name=f"restore_{what}")
-    def restore(name: Name, deletions: DeletionsOf) -> DeletionView:
+    @deletion_router.post(f"/v1/{what}s/{{name}}/restore", dependencies=dependencies.SUBMIT, name=f"restore_{what}")
+    def restore(name: Name, deletions: dependencies.DeletionsOf) -> DeletionView:
         """Restore a deleted resource unchanged, within the grace time (`GRASPD_SHARD_GRACE_S`)."""
         return deletions.restore(what, name)
 
@@ -161,17 +152,17 @@ class CreatedWebhook(WebhookView):
     secret: str = Field(description="shown only once")
 
 
-@event_router.get("/v1/events", dependencies=READ)
-def list_ends(webhooks: WebhooksOf, since: AfterEnd = 0, limit: Limit = 50) -> DeliveryPage:
+@event_router.get("/v1/events", dependencies=dependencies.READ)
+def list_ends(webhooks: dependencies.WebhooksOf, since: AfterEnd = 0, limit: dependencies.Limit = 50) -> DeliveryPage:
     """List ended jobs and datasets, oldest first. Ends are stored for 30 days; each appears at least once."""
     items = webhooks.end_events(since, limit=limit)
     return DeliveryPage(items=items, next=items[-1].seq if items else since)
 
 
-@event_router.get("/v1/events/stream", dependencies=READ, response_class=EventSourceResponse)
+@event_router.get("/v1/events/stream", dependencies=dependencies.READ, response_class=EventSourceResponse)
 async def stream_ends(
     request: Request,
-    webhooks: WebhooksOf,
+    webhooks: dependencies.WebhooksOf,
     since: AfterEnd = 0,
     last_event_id: Annotated[str | None, Header(max_length=20, description="takes precedence over `since`")] = None,
 ) -> AsyncIterable[ServerSentEvent]:
@@ -181,27 +172,29 @@ async def stream_ends(
         yield event
 
 
-@event_router.post("/v1/webhooks", status_code=201, dependencies=SUBMIT)
-def add_webhook(body: WebhookRequest, response: Response, webhooks: WebhooksOf) -> CreatedWebhook:
+@event_router.post("/v1/webhooks", status_code=201, dependencies=dependencies.SUBMIT)
+def add_webhook(body: WebhookRequest, response: Response, webhooks: dependencies.WebhooksOf) -> CreatedWebhook:
     """Add a webhook for ended jobs and datasets of the key's project. The secret is shown only once."""
     hook, secret = webhooks.add(body.url, body.states)
     response.headers["Location"] = f"/v1/webhooks/{hook.id}/deliveries"
     return CreatedWebhook(**hook.model_dump(), secret=secret)
 
 
-@event_router.get("/v1/webhooks", dependencies=SUBMIT)
-def list_webhooks(webhooks: WebhooksOf) -> list[WebhookView]:
+@event_router.get("/v1/webhooks", dependencies=dependencies.SUBMIT)
+def list_webhooks(webhooks: dependencies.WebhooksOf) -> list[WebhookView]:
     """List webhooks that the key may change, without their secrets."""
     return webhooks.all()
 
 
-@event_router.get("/v1/webhooks/{webhook_id}/deliveries", dependencies=SUBMIT)
-def list_deliveries(webhook_id: WebhookId, webhooks: WebhooksOf, limit: Limit = 50) -> list[DeliveryView]:
+@event_router.get("/v1/webhooks/{webhook_id}/deliveries", dependencies=dependencies.SUBMIT)
+def list_deliveries(
+    webhook_id: WebhookId, webhooks: dependencies.WebhooksOf, limit: dependencies.Limit = 50
+) -> list[DeliveryView]:
     """List deliveries of a webhook, newest first; stored for 30 days."""
     return webhooks.deliveries(webhook_id, limit=limit)
 
 
-@event_router.delete("/v1/webhooks/{webhook_id}", status_code=204, dependencies=SUBMIT)
-def delete_webhook(webhook_id: WebhookId, webhooks: WebhooksOf) -> None:
+@event_router.delete("/v1/webhooks/{webhook_id}", status_code=204, dependencies=dependencies.SUBMIT)
+def delete_webhook(webhook_id: WebhookId, webhooks: dependencies.WebhooksOf) -> None:
     """Delete a webhook."""
     webhooks.delete(webhook_id)

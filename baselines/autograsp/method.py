@@ -115,13 +115,6 @@ class HandCloser:
         self.data = Data(self.model, capacity)
         self._poses = Launches(self.model.device)
         add_poses(self._poses, self.model, self.data)
-        self.closing = self._closing()
-        with wp.ScopedDevice(self.model.device):
-            self.near = wp.zeros((capacity, self.hand.bodies), dtype=wp.float32)
-            self.pairs = wp.zeros((capacity, self.hand.bodies, self.hand.bodies), dtype=wp.float32)
-            self.stopped = wp.zeros((capacity, self.hand.dofs), dtype=wp.int32)
-
-    def _closing(self) -> Any:
         hand, points = self.hand, self.pair.fine.points
         lever = lever_arm_bounds(hand, points)
         moves = lever > 0
@@ -133,7 +126,11 @@ class HandCloser:
             out.finger = wp.array(finger_groups(moves), dtype=wp.int32)
             out.lower = wp.array(hand.lower, dtype=wp.float32)
             out.upper = wp.array(hand.upper, dtype=wp.float32)
-        return out
+        self.closing = out
+        with wp.ScopedDevice(self.model.device):
+            self.near = wp.zeros((capacity, self.hand.bodies), dtype=wp.float32)
+            self.pairs = wp.zeros((capacity, self.hand.bodies, self.hand.bodies), dtype=wp.float32)
+            self.stopped = wp.zeros((capacity, self.hand.dofs), dtype=wp.int32)
 
     def approach(self, state: HandState, standoff: float) -> HandState:
         """Move hands along their approach until the nearest body is `standoff` [m] from the object."""

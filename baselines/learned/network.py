@@ -117,7 +117,13 @@ def integrate_flow(network: ProposalNetwork, noise: Floats32, condition: Floats3
     x, c = np.asarray(noise, np.float32), np.asarray(condition, np.float32)
     with np.errstate(all="ignore"):  # checked below
         for step in range(network.steps):
-            x = x + _velocity(layers, x, step / network.steps, c) / np.float32(network.steps)
+            angles = 2 * np.pi * 2.0 ** np.arange(4) * (step / network.steps)
+            time = np.concatenate([np.sin(angles), np.cos(angles)]).astype(np.float32)
+            given = np.concatenate([x, np.broadcast_to(time, (len(x), len(time))), c], axis=1)
+            h = _silu(layers["flow.in"](given))
+            for block in range(BLOCKS):
+                h = h + layers[f"flow.{block}.b"](_silu(layers[f"flow.{block}.a"](h)))
+            x = x + layers["flow.out"](h) / np.float32(network.steps)
         found = np.asarray(x * network.std + network.mean, np.float32)
     if not np.isfinite(found).all():
         raise InputError(f"the network of {network.hand} proposes numbers that are not finite")
@@ -185,16 +191,6 @@ def _layers(network: ProposalNetwork) -> Mapping[str, _Layer]:
         vars(network)["layers"] = {name: _Layer.from_network(network, name) for name in names}
     found: Mapping[str, _Layer] = vars(network)["layers"]
     return found
-
-
-def _velocity(layers: Mapping[str, _Layer], x: Floats32, t: float, condition: Floats32) -> Floats32:
-    angles = 2 * np.pi * 2.0 ** np.arange(4) * t
-    time = np.concatenate([np.sin(angles), np.cos(angles)]).astype(np.float32)
-    given = np.concatenate([x, np.broadcast_to(time, (len(x), len(time))), condition], axis=1)
-    h = _silu(layers["flow.in"](given))
-    for block in range(BLOCKS):
-        h = h + layers[f"flow.{block}.b"](_silu(layers[f"flow.{block}.a"](h)))
-    return layers["flow.out"](h)
 
 
 def _silu(x: Floats32) -> Floats32:

@@ -11,21 +11,9 @@ import typer
 
 from graspd.api.formatting import count, minute, percent, size
 from graspd.api.uploads import MAIN_SUFFIXES, name_of_upload
-from graspd.client import access_commands, tag_commands
+from graspd.client import access_commands, reports, tag_commands
 from graspd.client.add_commands import add_hand, add_network, add_object, upload_of
 from graspd.client.client import Client, request_path
-from graspd.client.reports import (
-    UrlOption,
-    YesOption,
-    confirm,
-    open_client,
-    print_rows,
-    report_deletion,
-    restore,
-    show_asset,
-    show_job,
-    watch,
-)
 from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
 from graspd.service.command_options import parse_pairs, validate_options, with_options
 from graspd.service.model.domain import NETWORK_METHODS, JobOptions, JobRequest
@@ -37,6 +25,8 @@ from graspd.service.store.asset_summary import hand_line, self_test_line
 app = CommandGroup(no_args_is_help=True)
 
 JobArgument = Annotated[str, typer.Argument(help="Job id, or a prefix of it.")]
+WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")]
+AssetArgument = Annotated[str, typer.Argument(help="Name or digest of the asset.")]
 
 
 @app.command(epilog="graspd submit --hand allegro --object mug.stl --grasps 320 --scenes 2 --views 3 --wait")
@@ -45,12 +35,12 @@ def submit(
     hand: Annotated[str, typer.Option(help="Name of a hand, or a URDF or ZIP to upload.")],
     object: Annotated[str, typer.Option(help="Name of an object, or a mesh file to upload.")],
     options: dict[str, Any],
-    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
-    url: UrlOption = None,
+    wait: WaitOption = False,
+    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Submit a job: one hand on one object."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         object_name = partial(_asset_name, client, AssetKind.OBJECT)
         own = parse_pairs(options.get("options", ()))
         if options.get("method") in NETWORK_METHODS and "network" in own:
@@ -65,19 +55,19 @@ def submit(
         request = validate_options(JobRequest, options)
         job = client.submit(request)
         if wait:
-            job = watch(client, job.id)
-        show_job(job, json=json, url=client.url)
+            job = reports.watch(client, job.id)
+        reports.show_job(job, json=json, url=client.url)
 
 
 @app.command(epilog="graspd jobs --state running")
 def jobs(
     state: Annotated[State | None, typer.Option(help="Only jobs in this state.")] = None,
     limit: Annotated[int, typer.Option(min=1, max=200, help="Maximum number of jobs.")] = 20,
-    url: UrlOption = None,
+    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """List jobs, newest first."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         page = client.jobs(state=state, limit=limit)
     document = {"jobs": [job.model_dump(mode="json") for job in page.items], "next": page.next}
     rows = []
@@ -88,65 +78,62 @@ def jobs(
         rows.append((job.id[:12], job.state, job.hand, job.object, *last))
     names = ("job", "state", "hand", "object", "progress", "grasps", "created")
     empty = "no job yet; `graspd submit --hand allegro --object mug` makes one"
-    print_rows(document, names, rows, whole=("job", "state", "created"), empty=empty, json=json)
+    reports.print_rows(document, names, rows, whole=("job", "state", "created"), empty=empty, json=json)
 
 
 @app.command(epilog="graspd status 3f2a --json")
-def status(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+def status(job_id: JobArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
     """Show stages, progress and quality of a job."""
-    with open_client(url) as client:
-        show_job(client.job(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
+    with reports.open_client(url) as client:
+        reports.show_job(client.job(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
 
 
 @app.command(epilog="graspd cancel 3f2a")
-def cancel(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+def cancel(job_id: JobArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
     """Cancel a job; its results remain."""
-    with open_client(url) as client:
-        show_job(client.cancel(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
+    with reports.open_client(url) as client:
+        reports.show_job(client.cancel(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
 
 
 @app.command(epilog="graspd delete 3f2a")
-def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
+def delete(
+    job_id: JobArgument, yes: reports.YesOption = False, url: reports.UrlOption = None, json: JsonFlag = False
+) -> None:
     """Delete an ended job. Shards that no other job uses are deleted after a grace time."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         job = client.job(_full_id(client, job_id))
         asked = f"Delete job {job.id[:12]}, {job.hand} on {job.object}, with its {count(job.grasps)} grasps?"
-        confirm(asked, f"job {job.id[:12]}", yes=yes)
+        reports.confirm(asked, f"job {job.id[:12]}", yes=yes)
         client.delete(request_path("jobs", job.id))
-    report_deletion("job", job.id, json=json, undo=f"graspd restore {job.id[:12]}")
+    reports.report_deletion("job", job.id, json=json, undo=f"graspd restore {job.id[:12]}")
 
 
 @app.command("restore", epilog="graspd restore 3f2a")
 def restore_job(
     job_id: Annotated[str, typer.Argument(help="Id of a deleted job, or a prefix of it.")],
-    url: UrlOption = None,
+    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Restore a deleted job, within the grace time."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         gone = [one["id"] for one in client.send("GET", "/v1/deletions").json() if one["what"] == "job"]
-    restore(url, "job", _unique_id(gone, job_id), json=json)
+    reports.restore(url, "job", _unique_id(gone, job_id), json=json)
 
 
 @app.command(epilog="graspd retry 3f2a --wait")
-def retry(
-    job_id: JobArgument,
-    wait: Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")] = False,
-    url: UrlOption = None,
-    json: JsonFlag = False,
-) -> None:
+def retry(job_id: JobArgument, wait: WaitOption = False, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
     """Run failed and cancelled tasks of a job again; existing results are reused."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         job = client.retry(_full_id(client, job_id))
         if wait:
-            job = watch(client, job.id)
-        show_job(job, json=json, url=client.url)
+            job = reports.watch(client, job.id)
+        reports.show_job(job, json=json, url=client.url)
 
 
 @app.command(epilog="graspd logs 3f2a")
-def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+def logs(job_id: JobArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
     """Show failed attempts of a job with their reasons."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         job = client.job(_full_id(client, job_id))
     if json:
         print_json({"job": job.id, "attempts": [attempt.model_dump(mode="json") for attempt in job.attempts]})
@@ -169,10 +156,10 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
     @group.command("list", help=f"List {kind.value}s, by default without refused ones.")
     def list_assets(
         refused: Annotated[bool, typer.Option("--refused", help="Include refused ones.")] = False,
-        url: UrlOption = None,
+        url: reports.UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        with open_client(url) as client:
+        with reports.open_client(url) as client:
             assets = list(client.assets(kind, refused=refused))
         document = {f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]}
         # All networks have the same file name, so their hand is shown instead.
@@ -184,15 +171,17 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
             second = hand_line(asset.facts) if is_network else asset.filename
             rows.append((asset.name, second, size(asset.size_bytes), origin, asset.digest[:12]))
         names = ("name", "hand" if is_network else "file", "size", "check", "digest")
-        print_rows(document, names, rows, whole=("size", "digest"), json=json)
+        reports.print_rows(document, names, rows, whole=("size", "digest"), json=json)
 
     @group.command("show", help=f"Show a {kind.value} with the findings of its check.")
     def show(
-        name: Annotated[str, typer.Argument(help="Name of the asset.")], url: UrlOption = None, json: JsonFlag = False
+        name: Annotated[str, typer.Argument(help="Name of the asset.")],
+        url: reports.UrlOption = None,
+        json: JsonFlag = False,
     ) -> None:
-        with open_client(url) as client:
+        with reports.open_client(url) as client:
             asset = client.asset(kind, name)
-        show_asset(asset.model_dump(mode="json"), json=json)
+        reports.show_asset(asset.model_dump(mode="json"), json=json)
 
     @group.command(
         "delete",
@@ -200,28 +189,21 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         epilog=f"graspd {kind.value}s delete my_{kind.value}",
     )
     def delete_asset(
-        name: Annotated[str, typer.Argument(help="Name or digest of the asset.")],
-        yes: YesOption = False,
-        url: UrlOption = None,
-        json: JsonFlag = False,
+        name: AssetArgument, yes: reports.YesOption = False, url: reports.UrlOption = None, json: JsonFlag = False
     ) -> None:
-        with open_client(url) as client:
+        with reports.open_client(url) as client:
             client.asset(kind, name)
-            confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
+            reports.confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
             client.delete(request_path(f"{kind.value}s", name))
-        report_deletion(kind.value, name, json=json, undo=f"graspd {kind.value}s restore {name}")
+        reports.report_deletion(kind.value, name, json=json, undo=f"graspd {kind.value}s restore {name}")
 
     @group.command(
         "restore",
         help=f"Restore a deleted {kind.value} within the grace time.",
         epilog=f"graspd {kind.value}s restore my_{kind.value}",
     )
-    def restore_asset(
-        name: Annotated[str, typer.Argument(help="Name or digest of the asset.")],
-        url: UrlOption = None,
-        json: JsonFlag = False,
-    ) -> None:
-        restore(url, kind.value, name, json=json)
+    def restore_asset(name: AssetArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
+        reports.restore(url, kind.value, name, json=json)
 
     return group
 
@@ -233,15 +215,15 @@ networks_app.command("add", epilog="graspd networks add barrett.npz")(add_networ
 
 
 @objects_app.command("sets", epilog="graspd objects sets")
-def sets(url: UrlOption = None, json: JsonFlag = False) -> None:
+def sets(url: reports.UrlOption = None, json: JsonFlag = False) -> None:
     """List sets of objects; `graspd objects add FOLDER` makes one."""
-    with open_client(url) as client:
+    with reports.open_client(url) as client:
         found = client.object_sets()
     document = {"sets": [one.model_dump(mode="json") for one in found]}
     shown = [", ".join(one.objects[:5]) + ", ..." * (len(one.objects) > 5) for one in found]
     rows = [(one.name, count(len(one.objects)), text) for one, text in zip(found, shown, strict=True)]
     empty = "no set yet; `graspd objects add FOLDER` makes one"
-    print_rows(document, ("set", "objects", ""), rows, empty=empty, json=json)
+    reports.print_rows(document, ("set", "objects", ""), rows, empty=empty, json=json)
 
 
 app.add_typer(hands_app, name="hands")

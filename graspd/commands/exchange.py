@@ -28,12 +28,9 @@ app = CommandGroup(no_args_is_help=True)
 
 #: Formats of robots and their simulators; `moveit` and `urdf+yaml` are the same format.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
-TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
+TRAINING: Final = ("dexlearn", "graspgen", "huggingface", "lerobot")
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
-IMPORTS: Final = (
-    *("dexgraspbench", "dexlearn", "graspgen", "huggingface"),
-    *("dexgraspnet", "dexgraspnet2", "multidex", "ddgc", "reference"),
-)
+IMPORTS: Final = ("dexgraspbench", "dexlearn", "graspgen", "dexgraspnet", "multidex", "ddgc", "reference")
 
 
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
@@ -109,8 +106,8 @@ def import_(
     hand: Annotated[str | None, typer.Option(help="Hand: a URDF or a built-in.")] = None,
     object_: Annotated[str | None, typer.Option("--object", help="Mesh of the object at the source's scale 1.")] = None,
     robot: Annotated[str, typer.Option(help="multidex: name of the robot in the file.")] = "",
-    name: Annotated[str, typer.Option(help="multidex, graspgen, huggingface: name of the object.")] = "",
-    number: Annotated[int, typer.Option(help="ddgc, dexgraspnet2: number of the object in the scene.")] = 0,
+    name: Annotated[str, typer.Option(help="multidex, graspgen: name of the object.")] = "",
+    number: Annotated[int, typer.Option(help="ddgc: number of the object in the scene.")] = 0,
     validation: Annotated[str, typer.Option(help="Level: dexgraspbench, standard, fast or none.")] = "standard",
     friction: Annotated[float, typer.Option(help="Coulomb friction coefficient of the metrics.")] = 1.0,
     threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core.")] = 0,
@@ -148,7 +145,7 @@ def import_(
 
 def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, options: dict[str, Any]) -> list[Any]:
     """Return the sets of grasps in a file; `hand` is a URDF or built-in hand, `obj` a mesh at scale 1."""
-    from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, huggingface, published
+    from graspd.exchange import dexgraspbench, graspgen, published
 
     if format_ not in IMPORTS:
         raise InputError(f"there is no import format {format_!r}; choose one of {choices_text(format_, IMPORTS)}")
@@ -165,9 +162,7 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
         "dexgraspbench": (dexgraspbench.read, ()),
         "dexlearn": (dexgraspbench.read, ()),
         "graspgen": (graspgen.read, ("object_name",)),
-        "huggingface": (huggingface.read, ("object_name",)),
         "dexgraspnet": (published.read_dexgraspnet, ()),
-        "dexgraspnet2": (dexgraspnet2.read, ("number",)),
         "ddgc": (published.read_ddgc, ("number",)),
         "multidex": (published.read_multidex, ("robot", "object_name")),
     }

@@ -47,7 +47,16 @@ def check(
     if several := _object_set(file):
         if picture:
             raise InputError(f"--picture draws one object; {file} holds {len(several)}")
-        _check_set(several, options, json=json)
+        reports = []
+        for name, files in several.items():
+            reports.append({"name": name, **check_object(files, name, **options)})
+            if not json:
+                typer.echo(verdict_line(reports[-1]))
+        refused = [str(one["name"]) for one in reports if one["verdict"] == "refuse"]
+        if json:
+            print_json({"objects": reports, "refused": refused})
+        if refused:
+            raise InputError(f"{len(refused)} of {len(reports)} objects were refused: {', '.join(refused[:5])}")
         return
     report = report_object(file, options)
     if picture and report["verdict"] != "refuse":
@@ -72,19 +81,6 @@ def _object_set(file: str) -> Objects | None:
         if Path(file).is_dir():
             raise
         return None
-
-
-def _check_set(objects: Objects, options: dict[str, Any], *, json: bool) -> None:
-    reports = []
-    for name, files in objects.items():
-        reports.append({"name": name, **check_object(files, name, **options)})
-        if not json:
-            typer.echo(verdict_line(reports[-1]))
-    refused = [str(one["name"]) for one in reports if one["verdict"] == "refuse"]
-    if json:
-        print_json({"objects": reports, "refused": refused})
-    if refused:
-        raise InputError(f"{len(refused)} of {len(reports)} objects were refused: {', '.join(refused[:5])}")
 
 
 def report_object(file: str, options: dict[str, Any] | None = None) -> dict[str, Any]:

@@ -14,34 +14,14 @@ import sqlite3
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypedDict, TypeVar, Unpack
 
+import sqlalchemy as sa
 from pydantic_core import from_json
-from sqlalchemy import (
-    URL,
-    ColumnElement,
-    Connection,
-    Engine,
-    MetaData,
-    RowMapping,
-    Select,
-    Table,
-    bindparam,
-    case,
-    create_engine,
-    event,
-    exists,
-    inspect,
-    make_url,
-    or_,
-    select,
-    text,
-    tuple_,
-    update,
-)
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
@@ -70,7 +50,7 @@ _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 class Database:
     """Connection pool; reads and writes are context managers."""
 
-    def __init__(self, url: str | URL, *, anew: bool = False) -> None:
+    def __init__(self, url: str | sa.URL, *, anew: bool = False) -> None:
         """Connect, and make the tables of an empty database; `anew` replaces tables of another revision.
 
         InputError: unusable URL. IndexUnavailable: no answer, a read-only database, or another revision.
@@ -78,7 +58,10 @@ class Database:
         self._url = url
         self._anew = anew
         self.was = ""
-        self._file = _sqlite_file(url)
+        with convert_url_errors():
+            parsed = sa.make_url(url)
+            is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
+        self._file = SqliteFile(Path(str(parsed.database))) if is_file else None
         self._write_lock = threading.Lock()
         self._opening = threading.Lock()
         self._identity: Identity = None
@@ -89,7 +72,7 @@ class Database:
             self._engine = self._open()
 
     @contextmanager
-    def read_transaction(self, within: Connection | None = None) -> Iterator[Connection]:
+    def read_transaction(self, within: sa.Connection | None = None) -> Iterator[sa.Connection]:
         """Yield a connection whose queries all see one snapshot, or the given connection."""
         if within is not None:
             yield within
@@ -102,7 +85,7 @@ class Database:
             yield connection
 
     @contextmanager
-    def write_transaction(self, within: Connection | None = None) -> Iterator[Connection]:
+    def write_transaction(self, within: sa.Connection | None = None) -> Iterator[sa.Connection]:
         """Yield the given transaction, or a new one, committed as a whole; only one runs at a time."""
         if within is not None:
             yield within
@@ -113,30 +96,30 @@ class Database:
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
             else:
                 connection.exec_driver_sql(f"SET LOCAL lock_timeout = '{_BUSY_TIMEOUT_S:g}s'")
-                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _TURN_LOCK})
+                connection.execute(sa.text("SELECT pg_advisory_xact_lock(:key)"), {"key": _TURN_LOCK})
             yield connection
             connection.commit()
 
-    def rows(self, query: Select[Any], within: Connection | None = None) -> Sequence[RowMapping]:
+    def rows(self, query: sa.Select[Any], within: sa.Connection | None = None) -> Sequence[sa.RowMapping]:
         with self.read_transaction(within) as connection:
             return connection.execute(query).mappings().all()
 
-    def first_row(self, query: Select[Any], what: str, within: Connection | None = None) -> RowMapping:
+    def first_row(self, query: sa.Select[Any], what: str, within: sa.Connection | None = None) -> sa.RowMapping:
         """Return the first row; NotFoundError `there is no {what}` if there is none."""
         if not (found := self.rows(query, within)):
             raise NotFoundError(f"there is no {what}")
         return found[0]
 
-    def column(self, query: Select[Any]) -> list[Any]:
+    def column(self, query: sa.Select[Any]) -> list[Any]:
         with self.read_transaction() as connection:
             return list(connection.scalars(query))
 
-    def matching_rows(self, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]) -> list[Any]:
+    def matching_rows(self, query: sa.Select[Any], column: sa.ColumnElement[Any], wanted: Iterable[Any]) -> list[Any]:
         """Return the rows whose column has one of the wanted values, which may be any number of values."""
         with self.read_transaction() as connection:
             return list(rows_in(connection, query, column, wanted))
 
-    def value(self, query: Select[Any], within: Connection | None = None) -> Any:
+    def value(self, query: sa.Select[Any], within: sa.Connection | None = None) -> Any:
         """Return the first column of the first row; None without rows."""
         with self.read_transaction(within) as connection:
             return connection.scalar(query)
@@ -144,13 +127,13 @@ class Database:
     def ping(self) -> float:
         """Return the duration of a query [s]."""
         start = time.perf_counter()
-        self.value(select(1))
+        self.value(sa.select(1))
         return time.perf_counter() - start
 
     def close(self) -> None:
         self._engine.dispose()
 
-    def _open(self) -> Engine:
+    def _open(self) -> sa.Engine:
         engine = _engine(self._url)
         try:
             with convert_errors(), self._file.lock_for_opening() if self._file is not None else nullcontext():
@@ -165,7 +148,7 @@ class Database:
     def _store_identity(self) -> None:
         self._identity = self._file.identity() if self._file is not None else None
 
-    def _current_engine(self) -> Engine:
+    def _current_engine(self) -> sa.Engine:
         """Return the engine, or a new one if the file was removed or replaced."""
         if self._file is not None and self._file.identity() != self._identity:
             with self._opening:
@@ -202,23 +185,15 @@ def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
 
 
 def rows_in(
-    connection: Connection, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]
+    connection: sa.Connection, query: sa.Select[Any], column: sa.ColumnElement[Any], wanted: Iterable[Any]
 ) -> Iterator[Any]:
     for some in chunks(list(wanted)):
         yield from connection.execute(query.where(column.in_(some)))
 
 
-def _sqlite_file(url: str | URL) -> SqliteFile | None:
-    """Return the file of an SQLite index, None if it has no file; InputError for an invalid URL."""
+def _engine(url: str | sa.URL) -> sa.Engine:
     with convert_url_errors():
-        parsed = make_url(url)
-        is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
-    return SqliteFile(Path(str(parsed.database))) if is_file else None
-
-
-def _engine(url: str | URL) -> Engine:
-    with convert_url_errors():
-        return _sqlite_engine(url) if make_url(url).get_backend_name() == "sqlite" else connect_postgres(url)
+        return _sqlite_engine(url) if sa.make_url(url).get_backend_name() == "sqlite" else connect_postgres(url)
 
 
 @contextmanager
@@ -234,12 +209,12 @@ def convert_url_errors() -> Iterator[None]:
         ) from None
 
 
-def connect_postgres(url: str | URL) -> Engine:
+def connect_postgres(url: str | sa.URL) -> sa.Engine:
     """Return an engine without making tables; connections raise InputError unless the encoding is UTF-8."""
-    engine = create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
+    engine = sa.create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
 
     # Runs before SQLAlchemy inspects the connection: the inspection fails on SQL_ASCII databases, which return bytes.
-    @event.listens_for(engine, "connect", insert=True)
+    @sa.event.listens_for(engine, "connect", insert=True)
     def _require_utf8(connection: Any, _record: Any) -> None:
         info = getattr(connection, "info", None)
         if info is not None and (encoding := info.parameter_status("server_encoding")) != "UTF8":
@@ -251,10 +226,10 @@ def connect_postgres(url: str | URL) -> Engine:
     return engine
 
 
-def _sqlite_engine(url: str | URL) -> Engine:
-    engine = create_engine(url, connect_args={"timeout": _BUSY_TIMEOUT_S})
+def _sqlite_engine(url: str | sa.URL) -> sa.Engine:
+    engine = sa.create_engine(url, connect_args={"timeout": _BUSY_TIMEOUT_S})
 
-    @event.listens_for(engine, "connect")
+    @sa.event.listens_for(engine, "connect")
     def _set_pragmas(connection: Any, _record: Any) -> None:
         connection.isolation_level = None  # Only `write_transaction` begins transactions.
         for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", "temp_store=MEMORY"):
@@ -263,7 +238,7 @@ def _sqlite_engine(url: str | URL) -> Engine:
     return engine
 
 
-def _make_tables(engine: Engine, *, anew: bool) -> str:
+def _make_tables(engine: sa.Engine, *, anew: bool) -> str:
     """Make missing tables; return the revision of dropped tables, "" if none were dropped."""
     dropped = ""
     with _schema_transaction(engine) as connection:
@@ -271,24 +246,24 @@ def _make_tables(engine: Engine, *, anew: bool) -> str:
         if found and found != REVISION:
             if not anew:
                 raise IndexUnavailable(_revision_mismatch(found))
-            existing = MetaData()
+            existing = sa.MetaData()
             existing.reflect(connection)
             existing.drop_all(connection)
             found, dropped = "", found
         if not found:
             metadata.create_all(connection)
             connection.exec_driver_sql(f"CREATE TABLE {REVISION_TABLE} (version_num VARCHAR(32) NOT NULL)")
-            connection.execute(text(f"INSERT INTO {REVISION_TABLE} VALUES (:revision)"), {"revision": REVISION})
+            connection.execute(sa.text(f"INSERT INTO {REVISION_TABLE} VALUES (:revision)"), {"revision": REVISION})
         if added := _add_missing_metrics(connection):
             log.info("the index has new columns of grasps: %s", ", ".join(added))
     return dropped
 
 
-def revision_of(connection: Connection) -> str:
+def revision_of(connection: sa.Connection) -> str:
     """Return the revision of a database's tables; "" if it has none yet."""
-    if not inspect(connection).has_table(REVISION_TABLE):
+    if not sa.inspect(connection).has_table(REVISION_TABLE):
         return ""
-    return str(connection.scalar(text(f"SELECT version_num FROM {REVISION_TABLE}")) or "")
+    return str(connection.scalar(sa.text(f"SELECT version_num FROM {REVISION_TABLE}")) or "")
 
 
 def _revision_mismatch(found: str) -> str:
@@ -298,11 +273,11 @@ def _revision_mismatch(found: str) -> str:
 
 
 @contextmanager
-def _schema_transaction(engine: Engine) -> Iterator[Connection]:
+def _schema_transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
     """Yield a transaction, committed as a whole or not at all, while no other process makes tables."""
     with engine.connect() as connection:
         if connection.dialect.name == "postgresql":
-            connection.execute(text("SELECT pg_advisory_lock(:key)"), {"key": _TABLES_LOCK})
+            connection.execute(sa.text("SELECT pg_advisory_lock(:key)"), {"key": _TABLES_LOCK})
         else:
             connection.exec_driver_sql("BEGIN IMMEDIATE")
         try:
@@ -311,7 +286,7 @@ def _schema_transaction(engine: Engine) -> Iterator[Connection]:
         finally:
             if connection.dialect.name == "postgresql":
                 connection.rollback()  # Without it, the lock cannot be released after a failed statement.
-                connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": _TABLES_LOCK})
+                connection.execute(sa.text("SELECT pg_advisory_unlock(:key)"), {"key": _TABLES_LOCK})
                 connection.commit()
 
 
@@ -336,9 +311,9 @@ def _error_line(error: Exception) -> str:
     return first_line(getattr(error, "orig", None) or error)
 
 
-def _add_missing_metrics(connection: Connection) -> list[str]:
+def _add_missing_metrics(connection: sa.Connection) -> list[str]:
     """Add missing columns and indexes of the table `grasps`; return the names of the columns."""
-    found = inspect(connection)
+    found = sa.inspect(connection)
     existing = {column["name"] for column in found.get_columns(grasps.name)}
     missing = [metric.name for metric in indexed_metrics() if metric.name not in existing]
     for name in missing:
@@ -402,7 +377,7 @@ class SqliteFile:
 Row = Mapping[str, Any]
 
 
-def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: Sequence[str] = ()) -> None:
+def upsert(connection: sa.Connection, table: sa.Table, rows: Sequence[Row], *, keep: Sequence[str] = ()) -> None:
     """Insert or update rows of equal columns; the last row of a key counts. `keep` is never updated."""
     if not rows:
         return
@@ -416,26 +391,26 @@ def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: S
     connection.execute(statement, list(rows))
 
 
-def update_rows(connection: Connection, table: Table, rows: Sequence[Row], *, state: str) -> None:
+def update_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[Row], *, state: str) -> None:
     """Update the rows with the given `id` whose column `state` still equals `state`."""
     if not rows:
         return
-    values: dict[str, Any] = {name: bindparam(f"new_{name}") for name in rows[0] if name != "id"}
-    statement = update(table).where(table.c.id == bindparam("new_id"), table.c.state == state).values(**values)
+    values: dict[str, Any] = {name: sa.bindparam(f"new_{name}") for name in rows[0] if name != "id"}
+    statement = sa.update(table).where(table.c.id == sa.bindparam("new_id"), table.c.state == state).values(**values)
     connection.execute(statement, [{f"new_{name}": value for name, value in row.items()} for row in rows])
 
 
-Tests = tuple[ColumnElement[bool], ...]
+Tests = tuple[sa.ColumnElement[bool], ...]
 
 
-def scope_conditions(scope: ProjectScope, table: Table) -> Tests:
+def scope_conditions(scope: ProjectScope, table: sa.Table) -> Tests:
     """Return the scope's conditions on a table that has a column `project`."""
     return () if scope.everything else (table.c.project == scope.project,)
 
 
-def scope_conditions_by_job(scope: ProjectScope, table: Table) -> Tests:
+def scope_conditions_by_job(scope: ProjectScope, table: sa.Table) -> Tests:
     """Return the scope's conditions on a table that has a column `job_id`."""
-    of_project = select(jobs.c.id).where(jobs.c.project == scope.project)
+    of_project = sa.select(jobs.c.id).where(jobs.c.project == scope.project)
     return () if scope.everything else (table.c.job_id.in_(of_project),)
 
 
@@ -443,19 +418,19 @@ def asset_scope_conditions(scope: ProjectScope) -> Tests:
     """Return the scope's conditions on hands and objects: own, built-in and shared ones."""
     if scope.everything:
         return ()
-    return (or_(assets.c.project == scope.project, assets.c.builtin.is_(True), assets.c.shared.is_(True)),)
+    return (sa.or_(assets.c.project == scope.project, assets.c.builtin.is_(True), assets.c.shared.is_(True)),)
 
 
-def asset_scope_order(scope: ProjectScope) -> ColumnElement[int]:
+def asset_scope_order(scope: ProjectScope) -> sa.ColumnElement[int]:
     """Return the sort key of assets of one name: own ones first, then shared ones."""
-    shared = or_(assets.c.builtin.is_(True), assets.c.shared.is_(True))
-    return case((assets.c.project == scope.project, 0), (shared, 1), else_=2)
+    shared = sa.or_(assets.c.builtin.is_(True), assets.c.shared.is_(True))
+    return sa.case((assets.c.project == scope.project, 0), (shared, 1), else_=2)
 
 
-def shard_scope_conditions(scope: ProjectScope, shard: ColumnElement[Any]) -> Tests:
+def shard_scope_conditions(scope: ProjectScope, shard: sa.ColumnElement[Any]) -> Tests:
     """Return the condition that a job of the scope's project makes or reuses a shard."""
     wanted = (tasks.c.shard_id == shard, tasks.c.job_id == jobs.c.id, jobs.c.project == scope.project)
-    return () if scope.everything else (exists().where(*wanted),)
+    return () if scope.everything else (sa.exists().where(*wanted),)
 
 
 MAX_LIMIT: Final = 200
@@ -463,22 +438,29 @@ MAX_LIMIT: Final = 200
 _MOST: Final = 2**63
 
 
+class Paging(TypedDict, total=False):
+    """Requested part of a list: at most `limit` items (default: 50) from `cursor` (None: the first page)."""
+
+    limit: int
+    cursor: str | None
+
+
 def page_rows(
-    connection: Connection,
-    query: Select[Any],
-    *key: ColumnElement[Any],
-    limit: int,
-    cursor: str | None,
+    connection: sa.Connection,
+    query: sa.Select[Any],
+    *key: sa.ColumnElement[Any],
     descending: bool = True,
-) -> tuple[Sequence[RowMapping], str | None]:
+    **part: Unpack[Paging],
+) -> tuple[Sequence[sa.RowMapping], str | None]:
     """Return the rows of a page, ordered by `key`, and the next cursor; InputError as in `decode_cursor`."""
-    size = page_size(limit)
-    if cursor is not None:
-        start = decode_cursor(cursor, *(part.type.python_type for part in key))
-        query = query.where(tuple_(*key) < start if descending else tuple_(*key) > start)
-    query = query.order_by(*(part.desc() if descending else part for part in key)).limit(size + 1)
+    size = page_size(part.get("limit", 50))
+    if (cursor := part.get("cursor")) is not None:
+        start = decode_cursor(cursor, *(column.type.python_type for column in key))
+        query = query.where(sa.tuple_(*key) < start if descending else sa.tuple_(*key) > start)
+    query = query.order_by(*(column.desc() if descending else column for column in key)).limit(size + 1)
     rows = connection.execute(query).mappings().all()
-    return rows[:size], encode_cursor(*(rows[size - 1][str(part.key)] for part in key)) if len(rows) > size else None
+    last = rows[size - 1] if len(rows) > size else None
+    return rows[:size], encode_cursor(*(last[str(column.key)] for column in key)) if last is not None else None
 
 
 def encode_cursor(*key: Any) -> str:
@@ -500,3 +482,70 @@ def decode_cursor(cursor: str, *kinds: type | tuple[type, ...]) -> tuple[Any, ..
 
 def page_size(limit: int) -> int:
     return min(limit, MAX_LIMIT)
+
+
+#: Time to wait for a writer before the condition of an index is unknown [s].
+_TIMEOUT_S: Final = 5.0
+
+
+@dataclass(frozen=True)
+class IndexCondition:
+    """Kind, revision, connections and write permission of an index, read without changes."""
+
+    kind: str
+    revision: str
+    """Revision of the tables; "" before the first open."""
+    newest: str
+    connections: tuple[int, int] = (0, 0)
+    """Used and allowed connections; zeros if unknown."""
+    may_write: bool = True
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether opening the index would change nothing."""
+        return bool(self.revision) and self.revision == self.newest
+
+
+def read_condition(url: str | sa.URL) -> IndexCondition | None:
+    """Return the condition of an index, None without a file; errors of `Database`, or IndexDamaged."""
+    with convert_url_errors():
+        if (parsed := sa.make_url(url)).get_backend_name() == "sqlite":
+            return _file_condition(Path(str(parsed.database)))
+        return _postgres_condition(url)
+
+
+def _file_condition(path: Path) -> IndexCondition | None:
+    if not path.exists():
+        return None
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=_TIMEOUT_S)) as connection:
+            if (result := connection.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
+                raise IndexDamaged(f"the index {path} is damaged: {result}")
+            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            query = f"SELECT version_num FROM {REVISION_TABLE}"
+            rows = connection.execute(query).fetchall() if REVISION_TABLE in tables else []
+    except sqlite3.DatabaseError as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+            raise IndexDamaged(f"the index {path} is damaged: {error}") from None
+        raise IndexUnavailable(f"the index {path} cannot be read: {error}") from None
+    return IndexCondition(f"SQLite {sqlite3.sqlite_version}", rows[0][0] if rows else "", REVISION)
+
+
+def _postgres_condition(url: str | sa.URL) -> IndexCondition:
+    engine = connect_postgres(url)
+    try:
+        with convert_errors(), engine.connect() as connection:
+
+            def ask(question: str) -> str:
+                return str(connection.scalar(sa.text(question)))
+
+            return IndexCondition(
+                f"PostgreSQL {ask('SHOW server_version')}",
+                revision_of(connection),
+                REVISION,
+                (int(ask("SELECT count(*) FROM pg_stat_activity")), int(ask("SHOW max_connections"))),
+                ask("SELECT pg_is_in_recovery()") == "False"
+                and ask("SELECT has_schema_privilege(current_schema(), 'CREATE')") == "True",
+            )
+    finally:
+        engine.dispose()

@@ -22,28 +22,27 @@ class GraspdError(Exception):
     exit_code: ClassVar[int] = 1
     title: ClassVar[str] = "Something went wrong"
 
+    def __init_subclass__(cls, **properties: Any) -> None:
+        """Set the class variables of a subclass."""
+        for name, value in properties.items():
+            setattr(cls, name, value)
+
     def __str__(self) -> str:
         # Line breaks and escapes in quoted names or library messages would forge lines in logs and terminals.
         text = without_secrets(super().__str__())
         return _CONTROL.sub(lambda found: repr(found[0])[1:-1], _BREAK.sub(" ", text))
 
 
-class InputError(GraspdError):
+class InputError(GraspdError, slug="invalid-input", status=422, exit_code=2, title="The request cannot be used"):
     """The input of a request or command is invalid."""
 
-    slug, status, exit_code, title = "invalid-input", 422, 2, "The request cannot be used"
 
-
-class NotFoundError(InputError):
+class NotFoundError(InputError, slug="not-found", status=404, title="Not found"):
     """The named resource does not exist."""
 
-    slug, status, title = "not-found", 404, "Not found"
 
-
-class ConflictError(InputError):
+class ConflictError(InputError, slug="conflict", status=409, title="Conflict"):
     """The request conflicts with the present state."""
-
-    slug, status, title = "conflict", 409, "Conflict"
 
 
 class AssetError(InputError):
@@ -59,116 +58,80 @@ class AssetError(InputError):
         return cls(f"{problem}; {hint}", facts={"problem": problem, "options_suggested": list(fixes), **facts})
 
 
-class MeshError(AssetError):
+class MeshError(AssetError, slug="bad-mesh", title="The mesh cannot be used"):
     """An object mesh cannot be read or used."""
 
-    slug, title = "bad-mesh", "The mesh cannot be used"
 
-
-class HandError(AssetError):
+class HandError(AssetError, slug="bad-hand", title="The hand cannot be used"):
     """A hand description cannot be read or used."""
 
-    slug, title = "bad-hand", "The hand cannot be used"
 
-
-class SceneError(InputError):
+class SceneError(InputError, slug="bad-scene", title="The scene cannot be used"):
     """The object does not fit into the scene, or no grasp is found in it."""
 
-    slug, title = "bad-scene", "The scene cannot be used"
 
-
-class LoadError(InputError):
+class LoadError(InputError, slug="too-heavy", title="The object is too heavy for the hand"):
     """An object or a wanted payload exceeds what the hand can lift."""
 
-    slug, title = "too-heavy", "The object is too heavy for the hand"
 
-
-class LimitError(InputError):
+class LimitError(InputError, slug="too-large", status=413, title="Over the limit"):
     """The size or number exceeds a limit of the service."""
 
-    slug, status, title = "too-large", 413, "Over the limit"
 
-
-class QuotaError(InputError):
+class QuotaError(InputError, slug="quota-exceeded", status=429, title="The quota of the key is used up"):
     """The key has reached its quota of unfinished work."""
-
-    slug, status, title = "quota-exceeded", 429, "The quota of the key is used up"
 
     def __init__(self, message: str = "", *, retry_after_s: int = 60) -> None:
         super().__init__(message)
         self.headers = {"Retry-After": str(retry_after_s)}
 
 
-class UnavailableError(GraspdError):
+class UnavailableError(GraspdError, slug="unavailable", status=503, title="Temporarily unavailable"):
     """A part of the service does not answer; the same request may succeed later."""
 
-    slug, status, title = "unavailable", 503, "Temporarily unavailable"
 
-
-class QueueUnavailable(UnavailableError):
+class QueueUnavailable(UnavailableError, slug="queue-unavailable", title="The queue does not answer"):
     """Redis does not answer."""
 
-    slug, title = "queue-unavailable", "The queue does not answer"
 
-
-class StoreUnavailable(UnavailableError):
+class StoreUnavailable(UnavailableError, slug="store-unavailable", title="The object store does not answer"):
     """The object store does not answer or cannot be written."""
 
-    slug, title = "store-unavailable", "The object store does not answer"
 
-
-class IndexUnavailable(UnavailableError):
+class IndexUnavailable(UnavailableError, slug="index-unavailable", title="The index does not answer"):
     """The index database does not answer."""
 
-    slug, title = "index-unavailable", "The index does not answer"
 
-
-class IndexDamaged(IndexUnavailable):
+class IndexDamaged(IndexUnavailable, slug="index-damaged", title="The index is damaged"):
     """The file of the index is damaged; a new one replaces it and is rebuilt from the store."""
 
-    slug, title = "index-damaged", "The index is damaged"
 
-
-class RateError(UnavailableError):
+class RateError(UnavailableError, slug="too-many-requests", status=429, title="Too many requests"):
     """The request exceeds the rate limit of the service."""
 
-    slug, status, title = "too-many-requests", 429, "Too many requests"
 
-
-class BusyError(GraspdError):
+class BusyError(GraspdError, slug="busy", status=409, title="Already in use"):
     """Another process owns the resource."""
 
-    slug, status, title = "busy", 409, "Already in use"
 
-
-class DamagedError(GraspdError):
+class DamagedError(GraspdError, slug="damaged", title="A record in the store is damaged"):
     """A stored object does not match its name or checksum; a retry does not help."""
 
-    slug, title = "damaged", "A record in the store is damaged"
 
-
-class DamagedShard(DamagedError):
+class DamagedShard(DamagedError, slug="damaged-shard", title="A shard is damaged"):
     """A shard's file does not match its checksum, or is missing."""
 
-    slug, title = "damaged-shard", "A shard is damaged"
 
-
-class TaskError(GraspdError):
+class TaskError(GraspdError, slug="task-failed", title="The task failed"):
     """A task ended without a result."""
 
-    slug, title = "task-failed", "The task failed"
 
-
-class TaskCancelled(TaskError):
+class TaskCancelled(TaskError, slug="task-cancelled", title="The task was cancelled"):
     """The task was cancelled while it ran."""
 
-    slug, title = "task-cancelled", "The task was cancelled"
 
-
-class TaskRefused(TaskError):
+class TaskRefused(TaskError, slug="task-refused", title="The task was refused"):
     """The task has an unknown schema or function; the worker must neither run nor retry it."""
-
-    slug, title = "task-refused", "The task was refused"
 
 
 def _subclasses(kind: type[GraspdError]) -> Iterator[type[GraspdError]]:

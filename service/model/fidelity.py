@@ -1,6 +1,6 @@
 """Fidelities: named sets of a planner's settings."""
 
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from pydantic import Field
 
@@ -35,32 +35,21 @@ class Fidelity(Model):
     phong_alpha: float = Field(0.5, ge=0, le=1)
 
 
+#: Settings that differ between the fidelities for users.
+_VARIED: Final = (
+    *("starts", "finalists", "coarse_points", "fine_points", "object_points", "face_error_m"),
+    *("coarse_iterations", "fine_iterations", "polish_iterations"),
+)
+
+
+def _fidelity(name: str, *varied: Any) -> Fidelity:
+    return Fidelity(name=name, **dict(zip(_VARIED, varied, strict=True)))
+
+
 FIDELITIES: Final[dict[str, Fidelity]] = {
-    "draft": Fidelity(
-        name="draft",
-        starts=2,
-        finalists=1,
-        coarse_points=200,
-        fine_points=800,
-        object_points=2000,
-        face_error_m=1e-3,
-        coarse_iterations=60,
-        fine_iterations=20,
-        polish_iterations=6,
-    ),
+    "draft": _fidelity("draft", 2, 1, 200, 800, 2000, 1e-3, 60, 20, 6),
     "standard": Fidelity(name="standard"),
-    "fine": Fidelity(
-        name="fine",
-        starts=6,
-        finalists=3,
-        coarse_points=400,
-        fine_points=4000,
-        object_points=8000,
-        face_error_m=1e-4,
-        coarse_iterations=120,
-        fine_iterations=60,
-        polish_iterations=15,
-    ),
+    "fine": _fidelity("fine", 6, 3, 400, 4000, 8000, 1e-4, 120, 60, 15),
     # Settings of the paper: gradient descent with one rate, one contact sweep, no penetration penalty, no selection.
     "paper": Fidelity(
         name="paper",

@@ -2,34 +2,17 @@
 
 from typing import Final, Literal
 
+_BroadType = Literal["any", "balanced", "power", "precision", "pinch"]
+_LinearType = Literal[
+    "palmar_pinch", "prismatic_2_finger", "tripod", "prismatic_3_finger", "quadpod", "prismatic_4_finger"
+]
+_RoundType = Literal["precision_disk", "precision_sphere", "ring", "sphere_3_finger", "sphere_4_finger", "distal"]
+_HoldType = Literal[
+    "small_diameter", "medium_wrap", "large_diameter", "power_disk", "power_sphere", "fixed_hook", "lateral"
+]
 #: `any`: no requirement. `balanced`: the types of `BALANCED` in turn, one per batch. Types after `pinch` are those of
 #: the GRASP taxonomy (Feix et al., IEEE THMS 2016); `worker.quality.grasp_type` states the rules.
-GraspTypeName = Literal[
-    "any",
-    "balanced",
-    "power",
-    "precision",
-    "pinch",
-    "palmar_pinch",
-    "prismatic_2_finger",
-    "tripod",
-    "prismatic_3_finger",
-    "quadpod",
-    "prismatic_4_finger",
-    "precision_disk",
-    "precision_sphere",
-    "ring",
-    "sphere_3_finger",
-    "sphere_4_finger",
-    "distal",
-    "small_diameter",
-    "medium_wrap",
-    "large_diameter",
-    "power_disk",
-    "power_sphere",
-    "fixed_hook",
-    "lateral",
-]
+GraspTypeName = Literal[_BroadType, _LinearType, _RoundType, _HoldType]
 BALANCED: Final[tuple[GraspTypeName, ...]] = ("power", "precision", "pinch")
 #: Numbers of the types in the taxonomy.
 TAXONOMY: Final[dict[str, int]] = {

@@ -1,8 +1,8 @@
 """Table of all grasp metrics; perturbed parameters, grasp types and approach directions.
 
 Shards (`service.store.columns`), manifests, index, API, dashboard, dataset cards and docs derive from this table. A
-new metric needs a row here and a function (`MEASURES` in `worker.quality.table`). It must be `optional`, because older
-shards lack it. A yes-or-no property of a grasp is a verdict, not a metric.
+new metric needs a meaning and a row here, and a function (`MEASURES` in `worker.quality.table`). It must be
+`optional`, because older shards lack it. A yes-or-no property of a grasp is a verdict, not a metric.
 """
 
 import math
@@ -73,213 +73,95 @@ class GraspMetric:
         return f"{words}, {self.unit}" if self.unit else words
 
 
+#: Meaning of each metric.
+_MEANINGS: Final = {
+    "epsilon": "radius of the largest ball in the L1 grasp wrench space (Ferrari-Canny)",
+    "wrench_volume": "volume of the L1 grasp wrench space; nan: not measured at this threshold",
+    "contact_area_cm2": "hand surface closer to the object than the threshold",
+    "intersection_volume_cm3": "volume shared by hand and object",
+    "penetration_depth_mm": "deepest hand-object penetration",
+    "self_penetration_depth_mm": "deepest hand-hand penetration",
+    "simulated_displacement_cm": "displacement of the object in the displacement test; nan: not tested, or diverged",
+    "robustness": "share of positive verdicts under noise of 1 mm and 1 degree on the object; written by graspd 0.2",
+    "robust_share": "share of perturbed models in which the grasp holds, or a bound of it if the test ended early; "
+    "nan: not tested",
+    "payload_kg": "heaviest mass, at least the object's, that the grasp lifts in a scene or holds if pushed; nan: "
+    "not measured",
+    "shake_margin": "largest ratio of motion in the hand to its limit while shaken after the lift; below 1: held; "
+    "nan: not shaken",
+    "clearance_m": "least distance of the hand from supports and neighbours during approach, closing and lift",
+    "contact_links": "hand bodies within 2 mm of the object",
+    "grasp_type": "0 undefined, 1 power, 2 precision, 3 lateral; from the links in contact",
+    "taxonomy_type": "number of the type in the GRASP taxonomy, by the contacts; 0: none of the types with a rule",
+    "digits": "digits in contact: sum of 1 thumb, 2 index, 4 middle, 8 ring, 16 little; without a thumb in the "
+    "hand's order",
+    "region_share": "share of the contact area, within 2 mm of the object, that is in the required contact region",
+    "like_distance_m": "distance of the wrist from the demonstrated wrist pose",
+    "like_angle_deg": "angle of the wrist's rotation from the demonstrated wrist pose",
+    "approach_cell": "direction of approach in the object's frame: one of 48 equal-area cells, 12 x band of height + "
+    "azimuth sector",
+    "stability_loss": "stability loss L_stable of the planner; nan: the planner has none",
+}
+
+
+def _metric(name: str, units: str, title: str, **properties: Any) -> GraspMetric:
+    return GraspMetric(name, units, _MEANINGS[name], title, **properties)
+
+
+#: Properties of categories, of shares between 0 and 1, and of metrics with a long tail of bad values.
 _CODE: Final[dict[str, Any]] = {"whole": True, "code": True, "optional": True}
+_SHARE: Final[dict[str, Any]] = {"optional": True, "bounds": (0, 1), "digits": 2, "plot": "whole"}
+_COST: Final[dict[str, Any]] = {"less_is_better": True, "digits": 2, "plot": "cut"}
+_KEPT, _SORTED = IndexLevel.KEPT, IndexLevel.SORTED
 GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
-    GraspMetric(
-        "epsilon",
-        "1",
-        "radius of the largest ball in the L1 grasp wrench space (Ferrari-Canny)",
-        title="ε (Ferrari-Canny)",
-        short="ε",
-        swept=True,
-        digits=2,
-        plot="whole",
-    ),
-    GraspMetric(
-        "wrench_volume",
-        "1",
-        "volume of the L1 grasp wrench space; nan: not measured at this threshold",
-        title="Wrench space volume",
-        short="Vol",
-        swept=True,
-        indexed=IndexLevel.SORTED,
-        digits=1,
-    ),
-    GraspMetric(
-        "contact_area_cm2",
-        "cm^2",
-        "hand surface closer to the object than the threshold",
-        title="Contact area",
-        swept=True,
-        digits=0,
-        plot="whole",
-    ),
-    GraspMetric(
+    _metric("epsilon", "1", "ε (Ferrari-Canny)", short="ε", swept=True, digits=2, plot="whole"),
+    _metric("wrench_volume", "1", "Wrench space volume", short="Vol", swept=True, indexed=_SORTED, digits=1),
+    _metric("contact_area_cm2", "cm^2", "Contact area", swept=True, digits=0, plot="whole"),
+    _metric(
         "intersection_volume_cm3",
         "cm^3",
-        "volume shared by hand and object",
-        title="Intersection volume",
+        "Intersection volume",
         short="Intersection",
         less_is_better=True,
         digits=3,
         plot="cut",
     ),
-    GraspMetric(
-        "penetration_depth_mm",
-        "mm",
-        "deepest hand-object penetration",
-        title="Penetration",
-        less_is_better=True,
-        digits=2,
-        plot="cut",
-    ),
-    GraspMetric(
-        "self_penetration_depth_mm",
-        "mm",
-        "deepest hand-hand penetration",
-        title="Self-penetration",
-        indexed=IndexLevel.SORTED,
-        less_is_better=True,
-        digits=2,
-    ),
-    GraspMetric(
+    _metric("penetration_depth_mm", "mm", "Penetration", **_COST),
+    _metric("self_penetration_depth_mm", "mm", "Self-penetration", indexed=_SORTED, less_is_better=True, digits=2),
+    _metric(
         "simulated_displacement_cm",
         "cm",
-        "displacement of the object in the displacement test; nan: not tested, or diverged",
-        title="Simulated displacement",
+        "Simulated displacement",
         short="Displacement",
+        **_COST,
         optional=True,
         indexed=IndexLevel.NO,
-        less_is_better=True,
-        digits=2,
-        plot="cut",
     ),
-    GraspMetric(
-        "robustness",
-        "1",
-        "share of positive verdicts under noise of 1 mm and 1 degree on the object; written by graspd 0.2",
-        title="Share held under noise",
-        short="Robustness",
-        optional=True,
-        indexed=IndexLevel.KEPT,
-        bounds=(0, 1),
-        digits=2,
-        plot="whole",
+    _metric("robustness", "1", "Share held under noise", short="Robustness", **_SHARE, indexed=_KEPT),
+    _metric("robust_share", "1", "Robust share", short="Robust", **_SHARE),
+    _metric("payload_kg", "kg", "Payload", optional=True, bounds=(0, 100), digits=2, plot="cut"),
+    _metric("shake_margin", "1", "Motion when shaken", short="Shaken", **_COST, optional=True),
+    _metric("clearance_m", "m", "Clearance in its scene", short="Clearance", optional=True, bounds=(-1, 1), digits=4),
+    _metric("contact_links", "1", "Links in contact", whole=True, indexed=_KEPT, digits=0),
+    _metric("grasp_type", "enum", "Type", **_CODE, indexed=_SORTED, bounds=(0, 3)),
+    _metric("taxonomy_type", "enum", "Taxonomy type", **_CODE, indexed=_KEPT, bounds=(0, 33)),
+    _metric("digits", "1", "Digits in contact", **_CODE, indexed=_KEPT, bounds=(0, 63)),
+    _metric("region_share", "1", "Contact in the region", optional=True, indexed=_SORTED, bounds=(0, 1), digits=2),
+    _metric(
+        "like_distance_m", "m", "Distance from the demonstration", optional=True, indexed=_KEPT, less_is_better=True
     ),
-    GraspMetric(
-        "robust_share",
-        "1",
-        "share of perturbed models in which the grasp holds, or a bound of it if the test ended early; nan: not tested",
-        title="Robust share",
-        short="Robust",
-        optional=True,
-        bounds=(0, 1),
-        digits=2,
-        plot="whole",
-    ),
-    GraspMetric(
-        "payload_kg",
-        "kg",
-        "heaviest mass, at least the object's, that the grasp lifts in a scene or holds if pushed; nan: not measured",
-        title="Payload",
-        optional=True,
-        bounds=(0, 100),
-        digits=2,
-        plot="cut",
-    ),
-    GraspMetric(
-        "shake_margin",
-        "1",
-        "largest ratio of motion in the hand to its limit while shaken after the lift; below 1: held; nan: not shaken",
-        title="Motion when shaken",
-        short="Shaken",
-        optional=True,
-        less_is_better=True,
-        digits=2,
-        plot="cut",
-    ),
-    GraspMetric(
-        "clearance_m",
-        "m",
-        "least distance of the hand from supports and neighbours during approach, closing and lift",
-        title="Clearance in its scene",
-        short="Clearance",
-        optional=True,
-        bounds=(-1, 1),
-        digits=4,
-    ),
-    GraspMetric(
-        "contact_links",
-        "1",
-        "hand bodies within 2 mm of the object",
-        title="Links in contact",
-        whole=True,
-        indexed=IndexLevel.KEPT,
-        digits=0,
-    ),
-    GraspMetric(
-        "grasp_type",
-        "enum",
-        "0 undefined, 1 power, 2 precision, 3 lateral; from the links in contact",
-        title="Type",
-        **_CODE,
-        indexed=IndexLevel.SORTED,
-        bounds=(0, 3),
-    ),
-    GraspMetric(
-        "taxonomy_type",
-        "enum",
-        "number of the type in the GRASP taxonomy, by the contacts; 0: none of the types with a rule",
-        title="Taxonomy type",
-        **_CODE,
-        indexed=IndexLevel.KEPT,
-        bounds=(0, 33),
-    ),
-    GraspMetric(
-        "digits",
-        "1",
-        "digits in contact: sum of 1 thumb, 2 index, 4 middle, 8 ring, 16 little; without a thumb in the hand's order",
-        title="Digits in contact",
-        **_CODE,
-        indexed=IndexLevel.KEPT,
-        bounds=(0, 63),
-    ),
-    GraspMetric(
-        "region_share",
-        "1",
-        "share of the contact area, within 2 mm of the object, that is in the required contact region",
-        title="Contact in the region",
-        optional=True,
-        indexed=IndexLevel.SORTED,
-        bounds=(0, 1),
-        digits=2,
-    ),
-    GraspMetric(
-        "like_distance_m",
-        "m",
-        "distance of the wrist from the demonstrated wrist pose",
-        title="Distance from the demonstration",
-        optional=True,
-        indexed=IndexLevel.KEPT,
-        less_is_better=True,
-    ),
-    GraspMetric(
+    _metric(
         "like_angle_deg",
         "deg",
-        "angle of the wrist's rotation from the demonstrated wrist pose",
-        title="Angle from the demonstration",
+        "Angle from the demonstration",
         optional=True,
-        indexed=IndexLevel.KEPT,
+        indexed=_KEPT,
         bounds=(0, 180),
         less_is_better=True,
     ),
-    GraspMetric(
-        "approach_cell",
-        "1",
-        "direction of approach in the object's frame: one of 48 equal-area cells, 12 x band of height + azimuth sector",
-        title="Approach cell",
-        **_CODE,
-        indexed=IndexLevel.KEPT,
-        bounds=(0, 47),
-    ),
-    GraspMetric(
-        "stability_loss",
-        "1",
-        "stability loss L_stable of the planner; nan: the planner has none",
-        title="Stability loss",
-        indexed=IndexLevel.SORTED,
-        bounds=(-math.inf, math.inf),
-        less_is_better=True,
+    _metric("approach_cell", "1", "Approach cell", **_CODE, indexed=_KEPT, bounds=(0, 47)),
+    _metric(
+        "stability_loss", "1", "Stability loss", indexed=_SORTED, bounds=(-math.inf, math.inf), less_is_better=True
     ),
 )
 

@@ -31,26 +31,26 @@ SHARD_KINDS: Final[dict[Stage, str]] = {
 }
 STAGES: Final = {kind: stage for stage, kind in SHARD_KINDS.items()}
 
+#: Formats of keys and folders; each takes ids, names and numbers in the order of its places.
+job_record_key: Final = "jobs/{}/job.json".format
+job_events_folder: Final = "jobs/{}/events".format
+attempts_folder: Final = "tasks/{}/attempts".format
+attempt_key: Final = "tasks/{}/attempts/{}.json".format
+dataset_record_key: Final = "datasets/{}/dataset.json".format
+dataset_events_folder: Final = "datasets/{}/events".format
+dataset_snapshots_folder: Final = "datasets/{}/snapshots".format
+dataset_snapshot_key: Final = "datasets/{}/snapshots/{}.json".format
+object_set_key: Final = "object_sets/{}/{}.json".format
+webhook_key: Final = "webhooks/{}.json".format
+tag_versions_folder: Final = "tags/{}".format
+tag_version_key: Final = "tags/{}/{:06}.json".format
+mark_key: Final = "marks/{}.json".format
+deletion_key: Final = "deletions/{}/{}.json".format
+
 
 def asset_key(kind: AssetKind, digest: str, file: str) -> str:
     """Return the key of a file of an asset, as `asset.json` (its record), `files.zip` or `check.json`."""
     return f"{ASSETS}/{kind.value}/{digest}/{file}"
-
-
-def job_record_key(job: str) -> str:
-    return f"{JOBS}/{job}/job.json"
-
-
-def job_events_folder(job: str) -> str:
-    return f"{JOBS}/{job}/events"
-
-
-def attempts_folder(task: str) -> str:
-    return f"{TASKS}/{task}/attempts"
-
-
-def attempt_key(task: str, number: int) -> str:
-    return f"{attempts_folder(task)}/{number}.json"
 
 
 def shard_file_key(stage: Stage, shard: str) -> str:
@@ -59,46 +59,6 @@ def shard_file_key(stage: Stage, shard: str) -> str:
 
 def shard_manifest_key(stage: Stage, shard: str) -> str:
     return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.json"
-
-
-def dataset_record_key(dataset: str) -> str:
-    return f"{DATASETS}/{dataset}/dataset.json"
-
-
-def dataset_events_folder(dataset: str) -> str:
-    return f"{DATASETS}/{dataset}/events"
-
-
-def dataset_snapshots_folder(dataset: str) -> str:
-    return f"{DATASETS}/{dataset}/snapshots"
-
-
-def dataset_snapshot_key(dataset: str, digest: str) -> str:
-    return f"{dataset_snapshots_folder(dataset)}/{digest}.json"
-
-
-def object_set_key(name: str, digest: str) -> str:
-    return f"{OBJECT_SETS}/{name}/{digest}.json"
-
-
-def webhook_key(webhook: str) -> str:
-    return f"{WEBHOOKS}/{webhook}.json"
-
-
-def tag_versions_folder(tag: str) -> str:
-    return f"{TAGS}/{tag}"
-
-
-def tag_version_key(tag: str, number: int) -> str:
-    return f"{tag_versions_folder(tag)}/{number:06}.json"
-
-
-def mark_key(mark: str) -> str:
-    return f"{MARKS}/{mark}.json"
-
-
-def deletion_key(what: str, name: str) -> str:
-    return f"{DELETIONS}/{what}/{name}.json"
 
 
 MOST: Final = 64

@@ -91,18 +91,11 @@ def create_task_message(job: JobRecord, task: PlannedTask, *, attempt: int, max_
         newest_schema=TASK_SCHEMA,
         task_id=task.id,
         job_id=job.id,
-        stage=task.stage,
-        batch=task.batch,
-        count=task.count,
         revision=job.revisions[task.stage],
         attempt=attempt,
         max_attempt=max(attempt, max_attempt),
-        request=job.request,
-        hand_digest=job.hand_digest,
-        object_digest=job.object_digest,
-        inputs=task.inputs,
-        output=task.output,
-        origin=job.origin,
+        **{name: getattr(task, name) for name in ("stage", "batch", "count", "inputs", "output")},
+        **{name: getattr(job, name) for name in ("request", "hand_digest", "object_digest", "origin")},
     )
 
 

@@ -148,7 +148,10 @@ class Controller:
     def run_round(self, *, wait_s: float = 0.0) -> None:
         """Index new events, then run due duties; BusyError if another service has taken over the store."""
         self._identify()
-        self._ensure_index()
+        if not self._started:
+            self._start()
+        elif self._services.index.notes.completeness() is None or self._is_stale():
+            self._rebuild_index()
         away: list[UnavailableError] = []
         with _log_failures(away):
             self._index_events(0.0 if self._has_plans else min(wait_s, _PROGRESS_EVERY_S))
@@ -208,13 +211,6 @@ class Controller:
         lost, forgotten = timestamp(self._services.settings.lease_s), timestamp(_FORGET_WORKERS_AFTER_S)
         self._services.index.live.set_workers(present, lost_before=lost, forget_before=forgotten)
 
-    def _ensure_index(self) -> None:
-        """Ensure that the index is complete before events are applied; it may be lost at any time."""
-        if not self._started:
-            self._start()
-        elif self._services.index.notes.completeness() is None or self._is_stale():
-            self._rebuild_index()
-
     def _start(self) -> None:
         publish_builtins(self._services.store)
         for manifest in convert_packs(self._services.store):
@@ -226,7 +222,11 @@ class Controller:
         if made is None or made.left_out or self._is_stale():
             self._rebuild_index()
         else:
-            self._index_assets()
+            for kind, digest in stored_assets(self._services.store):
+                try:
+                    self._indexer.index_asset(kind, digest)
+                except DamagedError as error:
+                    log.warning("%s", error)
         self._started = True
 
     def _is_stale(self) -> bool:
@@ -243,13 +243,6 @@ class Controller:
     def _rebuild_index(self) -> None:
         log.warning("the index may lack records of the store: it is rebuilt from the store")
         rebuild(self._services.index, self._services.store, progress=lambda *_: self._alive.touch())
-
-    def _index_assets(self) -> None:
-        for kind, digest in stored_assets(self._services.store):
-            try:
-                self._indexer.index_asset(kind, digest)
-            except DamagedError as error:
-                log.warning("%s", error)
 
     def _index_events(self, wait_s: float) -> None:
         """Apply new events; events that need an unavailable store wait in the backlog."""

@@ -273,7 +273,10 @@ class GarbageCollector:
             for stage, shard in self._unneeded_shards(released):
                 if self._clock() > deadline:
                     return True
-                self._remove_shard(stage, shard)
+                with self._services.index.database.write_transaction() as connection:
+                    if self._services.index.removals.remove_shard(shard, within=connection):
+                        self._services.store.delete(names.shard_manifest_key(stage, shard))
+                        self._services.store.delete(names.shard_file_key(stage, shard))
             self._services.store.delete(key)
         return False
 
@@ -342,10 +345,3 @@ class GarbageCollector:
         for some in chunks(planned, _AT_ONCE):
             unneeded = self._services.index.removals.unneeded_shards([shard for _, shard in some])
             yield from ((stage, shard) for stage, shard in some if shard in unneeded)
-
-    def _remove_shard(self, stage: Stage, shard: str) -> None:
-        """Delete a shard unless a task produces it, manifest first: a shard without manifest does not exist."""
-        with self._services.index.database.write_transaction() as connection:
-            if self._services.index.removals.remove_shard(shard, within=connection):
-                self._services.store.delete(names.shard_manifest_key(stage, shard))
-                self._services.store.delete(names.shard_file_key(stage, shard))

@@ -74,22 +74,9 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
 )
 #: Folders in the order of a scan, which stores its position.
 FOLDERS: Final = (
-    names.SHARDS,
-    names.ASSETS,
-    names.JOBS,
-    names.TASKS,
-    names.DATASETS,
-    names.OBJECT_SETS,
-    names.DELETIONS,
-    names.RELEASED,
-    names.WEBHOOKS,
-    names.TAGS,
-    CHARTS,
-    IN_SCENES,
-    STABILITY,
-    names.MARKS,
-    names.SERVICE,
-    names.REMOVED,
+    *(names.SHARDS, names.ASSETS, names.JOBS, names.TASKS, names.DATASETS, names.OBJECT_SETS, names.DELETIONS),
+    *(names.RELEASED, names.WEBHOOKS, names.TAGS, CHARTS, IN_SCENES, STABILITY),
+    *(names.MARKS, names.SERVICE, names.REMOVED),
 )
 _SEALED: Final = (".json", ".zip", ".npz", ".glb")
 _SHARD: Final = re.compile(rf"shards/({'|'.join(names.STAGES)})/([0-9a-f]{{32}})\.(h5|json)")
@@ -257,7 +244,11 @@ class IntegrityScan:
         keys = self._next_keys(FOLDERS[note.folder], note.after)
         for key in keys:
             if is_checked(key):
-                self._check_key(key)
+                self._limit_rate(_LEAST)
+                wrong = examine(self._services.store, key, read=self._limit_rate)
+                if wrong is not None and not may_await_manifest(self._services.store, wrong):
+                    log.warning("%s: %s", wrong.key, wrong.what)
+                    self._services.index.damage.update([wrong])
             self._recheck_if_due(replace(note, after=key))
         over = len(keys) < _KEYS
         note = replace(note, folder=note.folder + over, after="" if over else keys[-1])
@@ -283,13 +274,6 @@ class IntegrityScan:
         stem, dot, _ = one.key.rpartition(".")
         keys = [f"{stem}.json", f"{stem}.h5"] if one.shard and dot else [one.key]
         return all(examine(self._services.store, key, read=self._limit_rate) is None for key in keys)
-
-    def _check_key(self, key: str) -> None:
-        self._limit_rate(_LEAST)
-        wrong = examine(self._services.store, key, read=self._limit_rate)
-        if wrong is not None and not may_await_manifest(self._services.store, wrong):
-            log.warning("%s: %s", wrong.key, wrong.what)
-            self._services.index.damage.update([wrong])
 
     def _next_keys(self, folder: str, after: str) -> list[str]:
         listed = self._services.store.list(folder, offset=after or None)
@@ -337,7 +321,11 @@ def _repair_object(services: Services, one: Damage, harmed: set[str]) -> str:
     if harmed & set(task.inputs):
         return "its input is made again first; run the command again when that is done"
     if one.what != MISSING:
-        _set_aside_result(services, one, stage)
+        file, manifest = names.shard_file_key(stage, one.shard), names.shard_manifest_key(stage, one.shard)
+        if one.what == BAD_MANIFEST:
+            services.store.set_aside(manifest)
+        if one.what not in (BAD_MANIFEST, NO_MANIFEST) or not _matches_index(services, one.shard, file):
+            services.store.set_aside(file)
     number = len(task_attempts(services.store, task.id)) + 1
     message = create_task_message(job, task, attempt=number, max_attempt=number)
     services.queue.enqueue([message], Priority.BULK, again=True)
@@ -360,15 +348,6 @@ def _repair_asset(services: Services, key: str, kind: AssetKind, digest: str, fi
             services.index.write.add_asset(load_asset(services.store, kind, digest), None)
             services.index.live.set_asset_waiting([digest], queued=False)
     return ""
-
-
-def _set_aside_result(services: Services, one: Damage, stage: Stage) -> None:
-    """Move a damaged result away; a file that the index knows stays if only its manifest is damaged."""
-    file, manifest = names.shard_file_key(stage, one.shard), names.shard_manifest_key(stage, one.shard)
-    if one.what == BAD_MANIFEST:
-        services.store.set_aside(manifest)
-    if one.what not in (BAD_MANIFEST, NO_MANIFEST) or not _matches_index(services, one.shard, file):
-        services.store.set_aside(file)
 
 
 def _matches_index(services: Services, shard: str, file: str) -> bool:

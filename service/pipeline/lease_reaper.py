@@ -11,7 +11,7 @@ from graspd.service.model.errors import DamagedError, NotFoundError, Unavailable
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.planning import ingest_id
 from graspd.service.model.records import AttemptRecord
-from graspd.service.model.states import AssetKind, Stage
+from graspd.service.model.states import Stage
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.indexer import Indexer
 from graspd.service.queue.port import Lease, rq_id
@@ -65,7 +65,13 @@ class LeaseReaper:
         self._recover_tasks([task for task in missing if task in tasks])
         for kind, digest in checks:
             if ingest_id(kind, digest) in missing:
-                self._recover_check(kind, digest)
+                if self._services.store.exists(names.asset_key(kind, digest, "check.json")):
+                    try:
+                        self._indexer.index_asset(kind, digest)
+                    except DamagedError as error:
+                        log.warning("%s", error)
+                else:
+                    self._services.index.live.set_asset_waiting([digest], queued=False)
         return missing
 
     def _recover_tasks(self, missing: list[str]) -> None:
@@ -108,15 +114,6 @@ class LeaseReaper:
         attempt = AttemptRecord.model_validate({**about, **why, "ended": timestamp(), "last": True})
         put_record(self._services.store, names.attempt_key(task_id, attempt.number), attempt)
         self._indexer.index_attempt(attempt)
-
-    def _recover_check(self, kind: AssetKind, digest: str) -> None:
-        if self._services.store.exists(names.asset_key(kind, digest, "check.json")):
-            try:
-                self._indexer.index_asset(kind, digest)
-            except DamagedError as error:
-                log.warning("%s", error)
-        else:
-            self._services.index.live.set_asset_waiting([digest], queued=False)
 
     def _handle_lost_lease(self, lease: Lease) -> None:
         worker, message = self._services.queue.lease_holder(lease)

@@ -18,16 +18,8 @@ Array = NDArray[Any]
 Where = Callable[[Mapping[str, Array]], Array]
 
 DEFAULT_COLUMNS: Final = (
-    "grasp/hand_pose",
-    "grasp/joint_positions",
-    "pregrasp/hand_pose",
-    "pregrasp/joint_positions",
-    "squeeze/hand_pose",
-    "squeeze/joint_positions",
-    "quality/epsilon",
-    "quality/contact_area_cm2",
-    "quality/penetration_depth_mm",
-    "quality/valid",
+    *(f"{posture}/{part}" for posture in ("grasp", "pregrasp", "squeeze") for part in ("hand_pose", "joint_positions")),
+    *("quality/epsilon", "quality/contact_area_cm2", "quality/penetration_depth_mm", "quality/valid"),
 )
 #: Number of shards cached in memory: about 0.1 MB each.
 _KEPT: Final = 256

@@ -24,12 +24,8 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 DEFAULT_COLUMNS: Final = (
-    "image/rgb",
-    "image/depth",
-    "image/segmentation",
-    "camera/intrinsics",
-    "camera/extrinsics",
-    "box/bounding_box_2d_tight",
+    *("image/rgb", "image/depth", "image/segmentation"),
+    *("camera/intrinsics", "camera/extrinsics", "box/bounding_box_2d_tight"),
 )
 _KEPT: Final = 64
 #: Number of cached row tables of shards: about 1 kB each.

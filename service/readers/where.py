@@ -39,7 +39,10 @@ def _evaluate(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any])
     if isinstance(node, Negation):
         return ~_evaluate(node.part, columns, said)
     if isinstance(node, Flag):
-        return _status_mask(node.name, columns)
+        if node.name in _MASKS:
+            return _MASKS[node.name](columns)
+        path = _FLAGS[node.name]
+        return np.asarray(columns[path]) == 1 if path in columns else np.zeros(len(columns["quality/valid"]), bool)
     compare = expressions.OPERATORS[node.op]
     if isinstance(node, MetricComparison):
         values = metric_values(_METRICS[node.name], columns)
@@ -49,13 +52,6 @@ def _evaluate(node: Node, columns: Mapping[str, Array], said: Mapping[str, Any])
         kinds = np.asarray(columns.get("quality/grasp_type", np.full(count, -1)))
         return np.asarray(compare(kinds, int(node.kind))) & (kinds >= 0)
     return np.full(count, bool(compare(str(said.get(node.name, "")), node.word)))
-
-
-def _status_mask(name: str, columns: Mapping[str, Array]) -> Mask:
-    if name in _MASKS:
-        return _MASKS[name](columns)
-    path = _FLAGS[name]
-    return np.asarray(columns[path]) == 1 if path in columns else np.zeros(len(columns["quality/valid"]), bool)
 
 
 def metric_values(metric: GraspMetric, columns: Mapping[str, Array]) -> NDArray[np.float64]:

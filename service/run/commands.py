@@ -130,7 +130,7 @@ def rebuild(
 
     With --check, exit code 1 means: index and store differ, or a shard is damaged.
     """
-    from graspd.service.index.condition import read_condition
+    from graspd.service.index.database import read_condition
     from graspd.service.index.rebuild import differences
     from graspd.service.index.rebuild import rebuild as fill
     from graspd.service.pipeline.backends import Services

@@ -125,11 +125,16 @@ class HandFacts(BaseModel):
     """Those of these links that are the root or moved by a joint."""
 
 
+def read_document(model: bytes) -> dict[str, Any]:
+    """Return the JSON document of binary glTF; struct.error or ValueError if there is none."""
+    (length,) = struct.unpack("<I", model[12:16])
+    return dict(json.loads(model[20 : 20 + length]))
+
+
 def read_hand_facts(model: bytes) -> HandFacts:
     """Read the facts in the binary glTF of a hand; ConflictError for a model of an older version."""
     try:
-        (length,) = struct.unpack("<I", model[12:16])
-        document = json.loads(model[20 : 20 + length])
+        document = read_document(model)
         extras = document["asset"]["extras"]
         bodies = [node["name"] for node in document["nodes"]]
         return HandFacts.model_validate(extras["facts"] | {"links": list(extras["links"]), "bodies": bodies})

@@ -15,28 +15,18 @@ from typing import Any, Final, Literal, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError
 
-from graspd.service.model import names
+from graspd.service.model import names, records
 from graspd.service.model.base import first_error
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import ConflictError, DamagedError, NotFoundError
-from graspd.service.model.records import (
-    AttemptRecord,
-    DatasetEvent,
-    DatasetRecord,
-    JobEvent,
-    JobRecord,
-    Record,
-    Snapshot,
-    Tag,
-)
 from graspd.service.model.renamed import convert_chart, convert_names, has_old_names
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.integrity import get_document, is_sealed, put_document, put_sealed
 from graspd.service.store.store import Store
 
 RecordT = TypeVar("RecordT", bound=BaseModel)
-EventT = TypeVar("EventT", JobEvent, DatasetEvent)
+EventT = TypeVar("EventT", records.JobEvent, records.DatasetEvent)
 #: Function that writes a record, unless the key exists; returns whether it wrote the record.
 Put = Callable[[str, BaseModel], bool]
 
@@ -75,8 +65,8 @@ def _append_event(make: Callable[..., EventT], store: Store, folder: str, put: P
             return event
 
 
-def job_events(store: Store, job: str) -> list[JobEvent]:
-    return _records(JobEvent, store, names.job_events_folder(job))
+def job_events(store: Store, job: str) -> list[records.JobEvent]:
+    return _records(records.JobEvent, store, names.job_events_folder(job))
 
 
 def add_job_event(
@@ -87,54 +77,56 @@ def add_job_event(
     *,
     cause: str = "",
     put: Put | None = None,
-) -> JobEvent:
-    make = partial(JobEvent, what=what, retried=retried or {}, cause=cause)
+) -> records.JobEvent:
+    make = partial(records.JobEvent, what=what, retried=retried or {}, cause=cause)
     return _append_event(make, store, names.job_events_folder(job), put)
 
 
-def task_attempts(store: Store, task: str) -> list[AttemptRecord]:
-    return sorted(_records(AttemptRecord, store, names.attempts_folder(task)), key=lambda attempt: attempt.number)
+def task_attempts(store: Store, task: str) -> list[records.AttemptRecord]:
+    return sorted(
+        _records(records.AttemptRecord, store, names.attempts_folder(task)), key=lambda attempt: attempt.number
+    )
 
 
-def load_dataset(store: Store, name: str) -> DatasetRecord:
-    return read_record(DatasetRecord, store, names.dataset_record_key(name))
+def load_dataset(store: Store, name: str) -> records.DatasetRecord:
+    return read_record(records.DatasetRecord, store, names.dataset_record_key(name))
 
 
-def dataset_events(store: Store, name: str) -> list[DatasetEvent]:
-    return _records(DatasetEvent, store, names.dataset_events_folder(name))
+def dataset_events(store: Store, name: str) -> list[records.DatasetEvent]:
+    return _records(records.DatasetEvent, store, names.dataset_events_folder(name))
 
 
 def add_dataset_event(
     store: Store, name: str, what: Literal["cancelled", "retried"], *, put: Put | None = None
-) -> DatasetEvent:
-    return _append_event(partial(DatasetEvent, what=what), store, names.dataset_events_folder(name), put)
+) -> records.DatasetEvent:
+    return _append_event(partial(records.DatasetEvent, what=what), store, names.dataset_events_folder(name), put)
 
 
-def load_snapshot(store: Store, dataset: str, digest: str) -> Snapshot:
-    return read_record(Snapshot, store, names.dataset_snapshot_key(dataset, digest))
+def load_snapshot(store: Store, dataset: str, digest: str) -> records.Snapshot:
+    return read_record(records.Snapshot, store, names.dataset_snapshot_key(dataset, digest))
 
 
-def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Snapshot:
+def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> records.Snapshot:
     if digest is not None:
         return load_snapshot(store, dataset, digest)
-    snapshots = _records(Snapshot, store, names.dataset_snapshots_folder(dataset))
+    snapshots = _records(records.Snapshot, store, names.dataset_snapshots_folder(dataset))
     if not snapshots:
         raise NotFoundError(f"dataset {dataset!r} has no snapshot; `graspd datasets snapshot {dataset}` takes one")
     return max(snapshots, key=lambda snapshot: (snapshot.created, snapshot.digest))
 
 
-def newest_tag_version(store: Store, tag: str) -> Tag | None:
+def newest_tag_version(store: Store, tag: str) -> records.Tag | None:
     keys = store.keys(names.tag_versions_folder(tag))
-    return read_record(Tag, store, keys[-1]) if keys else None
+    return read_record(records.Tag, store, keys[-1]) if keys else None
 
 
-def put_tag_version(put: Put, tag: Tag) -> None:
+def put_tag_version(put: Put, tag: records.Tag) -> None:
     """Write the next version of a tag; ConflictError if another change was written first."""
     if not put(names.tag_version_key(tag.id, tag.number), tag):
         raise ConflictError(f"the tag {tag.name!r} was changed a moment ago; try again")
 
 
-def delete_older_tag_versions(store: Store, tag: Tag) -> None:
+def delete_older_tag_versions(store: Store, tag: records.Tag) -> None:
     """Remove outdated versions of a tag; for a deleted tag then also the last version."""
     last = names.tag_version_key(tag.id, tag.number)
     for key in store.keys(names.tag_versions_folder(tag.id)):
@@ -199,7 +191,7 @@ _DIGITS: Final = re.compile(r"\D")
 What = Literal["hand", "object", "network", "job", "dataset", "tag"]
 
 
-class Deletion(Record):
+class Deletion(records.Record):
     """Deleted resource, with the data for its removal after the removal of its own record."""
 
     version: Literal[1] = 1
@@ -210,16 +202,16 @@ class Deletion(Record):
     name: str = Field("", description="name for users, if it differs from the id")
     submitter: str = Field("", description="id of the API key that submitted it")
     project: str = ""
-    job: JobRecord | None = None
+    job: records.JobRecord | None = None
     attempts: tuple[tuple[str, int], ...] = ()
 
 
-class DeletedJob(Record):
+class DeletedJob(records.Record):
     """Deleted job. Its shards are removed after the grace time, unless another job needs them."""
 
     version: Literal[1] = 1
     at: str
-    job: JobRecord
+    job: records.JobRecord
 
 
 def pending_deletions(store: Store) -> set[tuple[str, str]]:

@@ -163,7 +163,13 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
     if (folder := local_folder(url)) is not None:
         if not make and not folder.is_dir():
             raise NotFoundError(f"there is no store at {folder}; set GRASPD_DATA_DIR, or GRASPD_STORE_URL")
-        return _open_local(folder, url)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if not os.access(folder, os.W_OK | os.X_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            return Store(LocalStore(folder), url)
+        except (OSError, BaseError) as error:
+            raise StoreUnavailable(f"the store folder {folder} cannot be written: {_error_line(error)}") from None
     if parts.scheme not in ("s3", "gs", "az"):
         raise InputError(f"the store URL {url!r} names no known store; use file://, s3://, gs:// or az://")
     with _convert_errors(url, url):
@@ -201,16 +207,6 @@ def _remote_options(endpoint: str | None) -> dict[str, Any]:
     return options
 
 
-def _open_local(folder: Path, url: str) -> Store:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-        return Store(LocalStore(folder), url)
-    except (OSError, BaseError) as error:
-        raise StoreUnavailable(f"the store folder {folder} cannot be written: {_error_line(error)}") from None
-
-
 def _put_local(root: Path, key: str, data: IO[bytes]) -> bool:
     """Write a file, flush it to disk, then link it to its name: atomic even at a power failure."""
     path = root / key
@@ -231,16 +227,12 @@ def _put_local(root: Path, key: str, data: IO[bytes]) -> bool:
     finally:
         staged.unlink(missing_ok=True)
     for folder in {path.parent, *(folder.parent for folder in made)}:
-        _sync_folder(folder)
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
     return True
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 @contextmanager

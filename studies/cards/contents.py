@@ -64,6 +64,13 @@ def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, c
     Raises NotFoundError: the dataset or the snapshot does not exist; StoreUnavailable: the store does not answer."""
     taken = newest_snapshot(store, dataset, snapshot)
     record = load_dataset(store, dataset)
+    there = {shard.id for shard in taken.shards}
+    gaps = {}
+    for cell in record.cells():
+        tasks = plan_tasks(create_job_record(cell, record.options, record.revisions))
+        if missing := [task for task in tasks if task.output not in there]:
+            reasons = (attempts[-1].reason for task in missing if (attempts := task_attempts(store, task.id)))
+            gaps[cell.hand.name, cell.object.name] = len(missing), next(reasons, "not made yet, or cancelled")
     return Contents(
         dataset,
         open_shards(store, dataset=dataset, snapshot=taken.digest, cache=cache),
@@ -71,7 +78,7 @@ def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, c
         {obj.name: _stored_asset(store, AssetKind.OBJECT, obj.name, obj.digest) for obj in record.objects},
         taken,
         record,
-        _missing_cells(store, record, taken),
+        gaps,
     )
 
 
@@ -170,17 +177,6 @@ def _digests(shards: Shards, kind: AssetKind) -> dict[str, str]:
             with open_shard(shards.path(file)) as opened:
                 found[name] = str(opened.attrs.get(f"{kind.value}_digest", ""))
     return found
-
-
-def _missing_cells(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, tuple[int, str]]:
-    there = {shard.id for shard in taken.shards}
-    gaps = {}
-    for cell in record.cells():
-        tasks = plan_tasks(create_job_record(cell, record.options, record.revisions))
-        if missing := [task for task in tasks if task.output not in there]:
-            reasons = (attempts[-1].reason for task in missing if (attempts := task_attempts(store, task.id)))
-            gaps[cell.hand.name, cell.object.name] = len(missing), next(reasons, "not made yet, or cancelled")
-    return gaps
 
 
 #: Columns used for a card; missing ones are skipped.

@@ -163,7 +163,22 @@ def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
         if (pair, piece.file.batch) != batch_now:
             batch_now, valid = (pair, piece.file.batch), {}
         cell = tally.cells.setdefault(pair, CellTally())
-        _add_metadata(tally, cell, piece)
+        kind = piece.file.kind
+        tally.shards[kind] += 1
+        tally.bytes[kind] += piece.size_bytes
+        if "seconds" in piece.said:
+            tally.seconds[kind] = tally.seconds.get(kind, 0.0) + float(piece.said["seconds"])
+            cell.seconds += float(piece.said["seconds"])
+        for name in _ATTRIBUTES:
+            if (value := piece.said.get(name)) not in (None, ""):
+                tally.values.setdefault(name, Counter())[value] += 1
+        if piece.revision is not None:
+            tally.revisions.setdefault(kind, Counter())[piece.revision] += 1
+        if created := piece.said.get("created"):
+            tally.created = [min([*tally.created[:1], created]), max([*tally.created[1:], created])]
+        for name, value in piece.info.items():
+            if name.endswith("_seconds"):
+                tally.parts[name.removesuffix("_seconds")] += value
         hand = contents.hands.get(piece.file.hand, AssetFacts(piece.file.hand))
         if piece.file.kind == "base":
             valid[piece.file.id] = _add_base(tally, cell, piece, hand)
@@ -175,25 +190,6 @@ def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
         else:
             cell.n["pictures"] += piece.rows
     return tally
-
-
-def _add_metadata(tally: Tally, cell: CellTally, piece: ShardContents) -> None:
-    kind = piece.file.kind
-    tally.shards[kind] += 1
-    tally.bytes[kind] += piece.size_bytes
-    if "seconds" in piece.said:
-        tally.seconds[kind] = tally.seconds.get(kind, 0.0) + float(piece.said["seconds"])
-        cell.seconds += float(piece.said["seconds"])
-    for name in _ATTRIBUTES:
-        if (value := piece.said.get(name)) not in (None, ""):
-            tally.values.setdefault(name, Counter())[value] += 1
-    if piece.revision is not None:
-        tally.revisions.setdefault(kind, Counter())[piece.revision] += 1
-    if created := piece.said.get("created"):
-        tally.created = [min([*tally.created[:1], created]), max([*tally.created[1:], created])]
-    for name, value in piece.info.items():
-        if name.endswith("_seconds"):
-            tally.parts[name.removesuffix("_seconds")] += value
 
 
 def _add_base(tally: Tally, cell: CellTally, piece: ShardContents, hand: AssetFacts) -> Array:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspd.studies.chart.statistics import valid_rate_bound
 from graspd.studies.figures import COLOURS, INK, new_figure, plain_axes
@@ -123,19 +120,8 @@ def draw_panel(
             f"{axis}_bar": error_bar_ends(row, key) for axis, key in (("x", x), ("y", y)) if not (none and axis == "x")
         }
         labels.append(Label(axes, at, row[y], words, colour, **({"x_bar": (0.45 * at, at)} if none else {}), **ends))
-    _set_logarithmic(axes, [label.x * (0.5 if "0 of" in label.text else 1.0) for label in labels])
-    top = max([row[f"{y}_high"] for row in rows] or [1.0])
-    axes.set_ylim(-0.09 * top, 1.08 * top)
-    plain_axes(axes)
-    return labels
-
-
-def error_bar_ends(row: Row, key: str) -> tuple[float, float] | None:
-    return (row[f"{key}_low"], row[f"{key}_high"]) if f"{key}_low" in row else None
-
-
-def _set_logarithmic(axes: Any, values: Sequence[float]) -> None:
-    """Set a logarithmic axis of at least one decade, with plain numbers and space for labels on the right."""
+    # The axis has at least one decade, plain numbers, and space for labels on the right.
+    values = [label.x * (0.5 if "0 of" in label.text else 1.0) for label in labels]
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
@@ -146,6 +132,14 @@ def _set_logarithmic(axes: Any, values: Sequence[float]) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 1e3 * low else (1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
+    top = max([row[f"{y}_high"] for row in rows] or [1.0])
+    axes.set_ylim(-0.09 * top, 1.08 * top)
+    plain_axes(axes)
+    return labels
+
+
+def error_bar_ends(row: Row, key: str) -> tuple[float, float] | None:
+    return (row[f"{key}_low"], row[f"{key}_high"]) if f"{key}_low" in row else None
 
 
 def error_bar(row: Row, key: str) -> list[list[float]]:
@@ -161,21 +155,11 @@ def _label(row: Row, rows: Rows) -> str:
     return f"{row['fidelity']}, {row['batch']}" if several else str(row["fidelity"])
 
 
-Boxes = NDArray[np.float64]
-
-SIZE_PT: Final = 8
-#: Distances of a label from its point [pt], preferred ones first.
-_REACHES_PT: Final = (8.0, 15.0, 26.0, 38.0, 52.0)
-#: Directions from the point, preferred ones first [degrees].
-_TURNS: Final = (30, -30, 150, -150, 90, -90, 0, 180, 60, -60, 120, -120)
-#: Half the width of a marker [pt], and of a bar.
-_MARKER_PT: Final = 5.5
-_BAR_PT: Final = 1.5
-#: Cost per share of a label that is covered by another label or a point, covered by a bar, or outside the panel.
-_COVERED, _CROSSED, _OUTSIDE = 100.0, 8.0, 200.0
-#: Cost of the next distance, of a label nearer to another point, and of the next direction.
-_FARTHER, _TAKEN, _TURNED = 1.0, 2.5, 0.05
-_ROUNDS: Final = 6
+SIZE_PT: Final = 8  # size of labels
+_ALONG_BAR: Final = 5  # number of places on a bar that labels avoid
+_ROUNDS: Final = 500
+#: Space around labels, as factors on their sizes, and weights of moves away from labels and from points (x, y).
+_SPACING: Final[dict[str, Any]] = {"expand": (1.2, 1.6), "force_text": (0.3, 0.5), "force_static": (0.2, 0.4)}
 
 
 @dataclass(frozen=True)
@@ -192,115 +176,35 @@ class Label:
 
 
 def place_labels(figure: Any, labels: Sequence[Label]) -> list[Any]:
-    """Place the labels of all panels in an otherwise complete figure; return the new annotations."""
+    """Place the labels of all panels in an otherwise complete figure; return the new texts."""
     figure.draw_without_rendering()
-    made = []
-    for axes in dict.fromkeys(label.axes for label in labels):
-        made += _place_labels_on_axes(axes, figure.dpi / 72.0, [label for label in labels if label.axes is axes])
-    return made
+    return [
+        text
+        for axes in dict.fromkeys(label.axes for label in labels)
+        for text in _place_labels_on_axes(axes, [label for label in labels if label.axes is axes])
+    ]
 
 
-def _place_labels_on_axes(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
-    points = axes.transData.transform([(label.x, label.y) for label in labels])
-    markers = np.hstack([points - _MARKER_PT * pixels, points + _MARKER_PT * pixels])
-    bars = _error_bar_boxes(axes, labels, _BAR_PT * pixels)
-    panel = axes.get_window_extent()
-    inside = np.array([panel.x0, panel.y0, panel.x1, panel.y1])
-    worded = [index for index, label in enumerate(labels) if label.text]
-    offered = {index: _label_positions(points[index], _text_size(axes, labels[index].text), pixels) for index in worded}
-    fixed = {index: _fixed_costs(offered[index], points, index, bars, inside) for index in worded}
-    chosen = dict.fromkeys(worded, 0)
-    # Each label in turn moves to the best place among the other labels, until no label moves.
-    for _ in range(_ROUNDS):
-        before = dict(chosen)
-        for index in worded:
-            solid = np.vstack([markers, *(offered[other][chosen[other]] for other in worded if other != index)])
-            costs = [_COVERED * _covered_share(box, solid) for box in offered[index]]
-            chosen[index] = int(np.argmin(np.array(costs) + fixed[index]))
-        if chosen == before:
-            break
-    made = []
-    for index, at in chosen.items():
-        box = offered[index][at]
-        # A line connects a label with its point if the label is far away or nearer to another point.
-        led = at // len(_TURNS) > 1 or _is_nearer_to_another(box, points, index)
-        made.append(_draw_label(axes, labels[index], points[index], box, pixels, led=led))
-    return made
-
-
-def _fixed_costs(boxes: Sequence[Boxes], points: Boxes, own: int, bars: Boxes, inside: Boxes) -> Boxes:
-    return np.array(
-        [
-            _CROSSED * _covered_share(box, bars)
-            + _OUTSIDE * (1.0 - _covered_share(box, inside[None]))
-            + _FARTHER * (at // len(_TURNS))
-            + _TURNED * (at % len(_TURNS))
-            + _TAKEN * _is_nearer_to_another(box, points, own)
-            for at, box in enumerate(boxes)
-        ]
-    )
-
-
-def _is_nearer_to_another(box: Boxes, points: Boxes, own: int) -> bool:
-    away = np.linalg.norm(points - np.clip(points, box[:2], box[2:]), axis=1)
-    return bool(np.any(np.delete(away, own) < away[own]))
-
-
-def _draw_label(axes: Any, label: Label, point: Boxes, box: Boxes, pixels: float, *, led: bool) -> Any:
+def _place_labels_on_axes(axes: Any, labels: Sequence[Label]) -> list[Any]:
+    from adjustText import adjust_text
     from matplotlib.patheffects import withStroke
 
-    offset = (box[:2] - point) / pixels
-    line = {"arrowstyle": "-", "color": label.colour, "linewidth": 0.6, "alpha": 0.7, "shrinkA": 0, "shrinkB": 4}
-    style = {"fontsize": SIZE_PT, "color": label.colour, "ha": "left", "va": "bottom", "zorder": 4}
-    style |= {"arrowprops": line if led else None, "path_effects": [withStroke(linewidth=2, foreground="white")]}
-    where = {"xytext": offset, "textcoords": "offset points", "annotation_clip": False}
-    note = axes.annotate(label.text, (label.x, label.y), **where, **style)
-    # The layout was computed without labels: they must not move the panels.
-    note.set_in_layout(False)
-    return note
-
-
-def _text_size(axes: Any, text: str) -> tuple[float, float]:
-    """Return width and height of a label [px]."""
-    sample = axes.annotate(text, (0.5, 0.5), xycoords="axes fraction", fontsize=SIZE_PT)
-    extent = sample.get_window_extent()
-    sample.remove()
-    return float(extent.width), float(extent.height)
-
-
-def _label_positions(point: Boxes, size: tuple[float, float], pixels: float) -> list[Boxes]:
-    """Return boxes (left, bottom, right, top) [px] around the point, preferred ones first."""
-    found = []
-    for reach, turn in product(_REACHES_PT, _TURNS):
-        across, up = math.cos(math.radians(turn)), math.sin(math.radians(turn))
-        corner = point + reach * pixels * np.array([across, up])
-        # The label's nearest corner or side touches this place.
-        left = corner[0] - size[0] * (0.5 - 0.5 * _side(across))
-        bottom = corner[1] - size[1] * (0.5 - 0.5 * _side(up))
-        found.append(np.array([left, bottom, left + size[0], bottom + size[1]]))
-    return found
-
-
-def _side(part: float) -> float:
-    return 0.0 if abs(part) < 0.2 else math.copysign(1.0, part)
-
-
-def _error_bar_boxes(axes: Any, labels: Sequence[Label], half: float) -> Boxes:
-    ends = [((low, label.y), (high, label.y)) for label in labels if label.x_bar for low, high in [label.x_bar]]
-    ends += [((label.x, low), (label.x, high)) for label in labels if label.y_bar for low, high in [label.y_bar]]
-    if not ends:
-        return np.empty((0, 4))
-    least = axes.get_xlim()[0]
-    seen = [[(max(x, least), y) for x, y in pair] for pair in ends]
-    corners = axes.transData.transform(np.reshape(seen, (-1, 2))).reshape(-1, 4)
-    return np.hstack([corners[:, :2] - half, corners[:, 2:] + half])
-
-
-def _covered_share(box: Boxes, boxes: Boxes) -> float:
-    """Return the covered share of a box's area; overlaps count for each covering box."""
-    if not len(boxes):
-        return 0.0
-    across = np.minimum(box[2], boxes[:, 2]) - np.maximum(box[0], boxes[:, 0])
-    up = np.minimum(box[3], boxes[:, 3]) - np.maximum(box[1], boxes[:, 1])
-    area = (box[2] - box[0]) * (box[3] - box[1])
-    return float((np.clip(across, 0, None) * np.clip(up, 0, None)).sum() / area)
+    left = axes.get_xlim()[0]
+    bars = [
+        ((max(low, left), label.y), (high, label.y)) for label in labels if label.x_bar for low, high in [label.x_bar]
+    ]
+    bars += [((label.x, low), (label.x, high)) for label in labels if label.y_bar for low, high in [label.y_bar]]
+    ends = axes.transData.transform(np.reshape(bars, (-1, 2))).reshape(-1, 2, 2)
+    along = np.linspace(ends[:, 0], ends[:, 1], _ALONG_BAR).reshape(-1, 2)
+    # Labels keep away from the points, and from places along their bars.
+    places = np.concatenate([[(label.x, label.y) for label in labels], axes.transData.inverted().transform(along)])
+    worded = [label for label in labels if label.text]
+    texts = []
+    for label in worded:
+        style = {"color": label.colour, "path_effects": [withStroke(linewidth=2, foreground="white")], "zorder": 4}
+        texts.append(axes.text(label.x, label.y, label.text, fontsize=SIZE_PT, clip_on=False, **style))
+        # The layout was computed without labels: they must not move the panels.
+        texts[-1].set_in_layout(False)
+    line = {"arrowstyle": "-", "color": INK, "linewidth": 0.6, "alpha": 0.7, "shrinkB": 4}
+    adjust_text(texts, *places.T, ax=axes, iter_lim=_ROUNDS, arrowprops=line, **_SPACING)
+    return texts

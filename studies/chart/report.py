@@ -54,10 +54,18 @@ def markdown(chart: Row) -> str:
         parts += ["## Each hand", "![Success under the DexGraspBench protocol over speed](chart.hands.png)"]
         parts += [f"### {hand}\n\n{summary_table(rows)}" for hand, rows in chart["by_hand"].items()]
     parts += ["## Each hand and object", runs_table(chart["runs"])]
+    groups: dict[tuple[str, str, str], list[Row]] = {}
+    for run in chart["runs"]:
+        groups.setdefault((run["hand"], run["method"], run["fidelity"]), []).append(run["best"])
+    columns = {"ca_cm2": ".1f", "iv_cm3": ".2f", "epsilon": ".3f", "wrench_volume": ".2f", "sd_cm": ".2f"}
+    found = [
+        [*names, *(f"{_mean(rows, key):{form}}" for key, form in columns.items())]
+        for names, rows in sorted(groups.items())
+    ]
     parts += [
         "## The best ten by epsilon",
         "Means over each pair's best ten grasps by ε, as in table 2 of the Fast-Grasp'D paper, then over objects.",
-        best_table(chart["runs"]),
+        markdown_table("hand | method | fidelity | CA cm² ↑ | IV cm³ ↓ | ε ↑ | Vol ↑ | SD cm ↓", found, left=3),
     ]
     return "\n\n".join(part for part in parts if part)
 
@@ -152,19 +160,6 @@ def runs_table(runs: Sequence[Row]) -> str:
 def cells_text(row: Row, columns: Mapping[str, str]) -> list[str]:
     """Return values of a row as texts; `columns` has their number formats, empty for names and counts."""
     return [format_value(row[key], form) for key, form in columns.items()]
-
-
-def best_table(runs: Sequence[Row]) -> str:
-    """Return means as in the paper's table 2: contact area, intersection, ε, wrench volume, displacement."""
-    groups: dict[tuple[str, str, str], list[Row]] = {}
-    for run in runs:
-        groups.setdefault((run["hand"], run["method"], run["fidelity"]), []).append(run["best"])
-    columns = {"ca_cm2": ".1f", "iv_cm3": ".2f", "epsilon": ".3f", "wrench_volume": ".2f", "sd_cm": ".2f"}
-    found = [
-        [*names, *(f"{_mean(rows, key):{form}}" for key, form in columns.items())]
-        for names, rows in sorted(groups.items())
-    ]
-    return markdown_table("hand | method | fidelity | CA cm² ↑ | IV cm³ ↓ | ε ↑ | Vol ↑ | SD cm ↓", found, left=3)
 
 
 def _mean(rows: Sequence[Row], key: str) -> float:

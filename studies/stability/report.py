@@ -92,7 +92,16 @@ def draw(one: studies.StabilityMap, path: Path) -> None:
     figure.suptitle(one.title, x=0.01, ha="left", fontsize=13, fontweight="bold")
     figure.draw_without_rendering()
     for axes in grid.flat:
-        _fit_axes(axes)
+        # Numbers shrink to fit their cells, or are omitted.
+        left, right = axes.get_xlim()
+        room = 0.88 * axes.get_window_extent().width / max(1.0, right - left)
+        for text in axes.texts:
+            for size in _FONT_SIZES:
+                text.set_fontsize(size)
+                if text.get_window_extent().width <= room:
+                    break
+            else:
+                text.set_visible(False)
     figure.savefig(path, dpi=110)
 
 
@@ -124,19 +133,6 @@ def _panel(axes: Any, one: studies.StabilityMap, panel: str) -> None:
             lw=1.6,
             ls="--",
         )
-
-
-def _fit_axes(axes: Any) -> None:
-    """Shrink the numbers to fit their cells, or omit them."""
-    left, right = axes.get_xlim()
-    room = 0.88 * axes.get_window_extent().width / max(1.0, right - left)
-    for text in axes.texts:
-        for size in _FONT_SIZES:
-            text.set_fontsize(size)
-            if text.get_window_extent().width <= room:
-                break
-        else:
-            text.set_visible(False)
 
 
 def _wrap_label(value: float | str) -> str:

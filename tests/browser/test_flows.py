@@ -163,7 +163,9 @@ def test_a_refused_file_stays_and_runs_once_its_units_are_right(real_page: Any, 
     assert page.is_disabled("text=Submit the job")
     assert "was refused" in page.inner_text("#blocked")
     assert page.input_value("#object") == ""
-    assert page.get_attribute("[data-thing=object] figure", "data-state") == "none"
+    page.wait_for_selector("[data-thing=object] figure[data-state=ready]")
+    assert "The picture shows it in millimetres." in page.inner_text("[data-thing=object] [data-found]")
+    assert page.inner_text("[data-thing=object] [data-scale]").endswith(("mm", "cm"))
     assert "--" not in page.inner_text("[data-thing=object] [data-found]")
     page.click("button:has-text('Read in millimetres: 60 mm long')")
     page.wait_for_selector("[data-thing=object] [data-found][data-state=good]")
@@ -241,6 +243,6 @@ def test_every_part_of_the_dashboard_works_below_the_path(page: Any, services: S
 
     page.goto(f"{address}/submit")
     block = builtin_files(AssetKind.OBJECT, "block")["block.stl"]
-    with page.expect_response(f"**{PREFIX}/v1/objects") as sent:
+    with page.expect_response(f"**{PREFIX}/submit") as sent:
         page.set_input_files("#file", {"name": "mine.stl", "mimeType": "model/stl", "buffer": block})
     assert sent.value.ok

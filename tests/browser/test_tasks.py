@@ -1,5 +1,6 @@
 """Tasks of a person, with the clicks and seconds that they take; and the views of grasps."""
 
+import gzip
 import time
 from pathlib import Path
 from typing import Any
@@ -135,6 +136,22 @@ def test_a_replay_moves_the_object_and_its_forces_are_told(page: Any, services: 
     page.wait_for_selector("[data-balance]:not([hidden])")
     until(lambda: page.get_attribute(".viewer input[type=range]", "aria-valuetext") == "pushes", "the view is back")
     assert len(page.watch.trouble) == 1 and "503" in page.watch.trouble.pop(), "the browser tells of the refusal"
+
+
+#: Largest gzipped size of a page with its styles, scripts and figures, without models and fonts [bytes].
+PAGE_BYTES = 150_000
+
+
+def test_pages_with_3d_views_are_light(page: Any, services: Services) -> None:
+    shard = finish_all(services, add_job(services))[0].shard_id
+    answers: list[Any] = []
+    page.on("response", lambda answer: answers.append(answer))
+    for path in (f"/grasps/{shard}/0", "/grasps", "/submit", "/hands/shadow", "/objects"):
+        answers.clear()
+        page.goto(path)
+        page.wait_for_selector("canvas:is([data-state=ready], [data-state=ready] *)")
+        parts = [one for one in answers if one.request.resource_type in ("document", "script", "stylesheet")]
+        assert len(parts) > 5 and sum(len(gzip.compress(one.body())) for one in parts) < PAGE_BYTES, path
 
 
 def test_grasps_side_by_side_move_together(page: Any, services: Services) -> None:

@@ -55,7 +55,7 @@ def exported(on_tables: Path, tmp_path_factory: pytest.TempPathFactory):
     @cache
     def export(format_: str) -> Path:
         folder = tmp_path_factory.mktemp(format_) / "data"
-        every = "" if format_ in ("dexgraspnet2", "graspgen") else "--all "
+        every = "" if format_ == "graspgen" else "--all "
         assert graspd(f"export --format {format_} {every}-o", folder, on_tables)["grasps"] == 16
         return folder
 
@@ -72,7 +72,6 @@ def _exported(name: str, format_: str):
 
 checkout, data = _exported("checkout", "dexlearn"), _exported("data", "graspgen")
 folder = _exported("folder", "huggingface")
-root = _exported("root", "dexgraspnet2")
 
 
 @pytest.fixture(scope="session")

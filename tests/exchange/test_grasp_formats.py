@@ -4,9 +4,7 @@ import io
 import json
 import os
 import tarfile
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from graspd.client.dataset_commands import read_spec
 from graspd.commands.exchange import read_sets
 from graspd.commands.studies import _read_record as read_study
-from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, published, replicator, webdataset
+from graspd.exchange import dexgraspbench, graspgen, published, replicator, webdataset
 from graspd.exchange.bench_hand import _read_mapping as read_mapping
 from graspd.exchange.bench_scene import object_of_scene, save_record
 from graspd.exchange.imported import Origin, joints_by_name, load_npy, parse_verdicts, scaled_object
@@ -177,19 +175,15 @@ def test_verdicts_are_known_or_not_and_two_scales_are_two_objects() -> None:
 @pytest.mark.parametrize(
     ("name", "files", "rounding"),
     [
-        ("dexgraspnet2", "data/dex_grasps_new/*/*/block.npz", 1e-9),
         ("dexlearn", "assets/grasp/graspd_tabletop_graspd_barrett/succ_collect/*/block", 1e-8),
         ("graspgen", "grasps/barrett", 1e-9),
-        ("huggingface", "", 1e-9),
     ],
 )
 def test_grasps_of_a_training_format_come_back(name: str, files: str, rounding: float, exported, stored: Shard) -> None:
-    if name == "huggingface":
-        pytest.importorskip("pyarrow")
     options, found = {"robot": "", "object_name": "block", "number": 0}, []
-    for file in sorted(exported(name).glob(files)) if files else [exported(name)]:
+    for file in sorted(exported(name).glob(files)):
         for back in read_sets(name, file, "barrett", "block", options):
-            assert back.published is not None and (back.placed is None) == (name in ("dexgraspnet2", "graspgen"))
+            assert back.published is not None and (back.placed is None) == (name == "graspgen")
             for k, pose in enumerate(back.grasps.grasp.hand_pose):
                 (row,) = np.flatnonzero(np.abs(stored["grasp/hand_pose"][:, :3] - pose[:3]).max(axis=1) < rounding)
                 found.append(int(row))
@@ -222,7 +216,6 @@ HAND, GIVEN = hand_from_path("barrett"), {"hand": "barrett", "obj": "block"}
 QPOS = {f"{name}_qpos": np.zeros(15) for name in dexgraspbench.POSTURES}
 SIX = {"task": {"obj_name": "x"}, "scene": {"x": {"pose": np.zeros(6), "scale": [1.0]}}}
 NO_SCENE = Shard("base", {}, {"scene/object_pose": np.zeros((1, 7)), "grasp/scene_index": np.zeros(1)})
-ROW_OF = SimpleNamespace(hand=replace(HAND, joint_names=("row", *HAND.joint_names[1:])))
 #: What readers and writers refuse, by their words.
 REFUSED = {
     "no import format 'foo'": lambda at: read_sets("foo", at, "h", "o", {}),
@@ -249,7 +242,6 @@ REFUSED = {
     "q has 3 numbers": lambda at: published.read_multidex(at, robot="a", object_name="mug", **GIVEN),
     "no file of reference grasps: it .* object": lambda at: stored_friction(listed(at)),
     "no record of GraspGen: it .* object": lambda at: graspgen.read(listed(at), **GIVEN),
-    "joint 'row', which is a key": lambda at: dexgraspnet2._write_grasps(None, ROW_OF, at, None),
     "has no joint 'elbow'": lambda at: joints_by_name(HAND, ["elbow"], [[0.0]], what="x"),
     "1 joint values for 2 joints": lambda at: joints_by_name(HAND, ["elbow", "wrist"], [[0.0]], what="x"),
     "does not say which": lambda at: scenes_of_shard(NO_SCENE),
@@ -273,7 +265,7 @@ def test_a_shard_with_the_joints_of_another_hand_is_refused(stored: Shard, tmp_p
 
 
 #: What an export begins with.
-BEGUN = {"dexgraspnet2": "data", "dexlearn": "assets/object/graspd", "graspgen": "grasps", "huggingface": "grasps"}
+BEGUN = {"dexlearn": "assets/object/graspd", "graspgen": "grasps", "huggingface": "grasps"}
 BEGUN |= {"webdataset": "pictures-000000.tar"}
 
 

@@ -10,8 +10,6 @@ import yaml
 from PIL import Image
 
 from graspd.exchange import huggingface
-from graspd.service import parquet
-from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import apply, compose, pose_from_matrix
 from graspd.service.readers import Pictures, open_shards
 from graspd.worker.hands.kinematics import body_poses
@@ -84,26 +82,6 @@ def test_picture_has_what_was_seen_and_fingertips_where_they_are(folder, on_tabl
         at = compose(stored["scene/object_pose"][row["scene"]], stored["grasp/hand_pose"][some])
         on_table = body_poses(hand, at, stored["grasp/joint_positions"][some])[:, tip, :3]
         np.testing.assert_allclose(tips, apply(camera, on_table), atol=ROUNDING_M * 1e3)
-
-
-def test_what_is_no_table_of_grasps_is_told(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match="block, mug"):
-        huggingface.read(folder, hand="barrett", obj="block")
-    (tmp_path / "x.parquet").write_bytes(b"PAR1 no table PAR1")
-    with pytest.raises(InputError, match="not a readable Parquet file"):
-        huggingface.read(tmp_path / "x.parquet", hand="barrett", obj="block")
-    with pytest.raises(InputError, match="no column"):
-        huggingface.read(next((folder / "pictures").iterdir()), hand="barrett", obj="block")
-    monkeypatch.setattr(parquet, "LARGEST", 100)
-    with pytest.raises(InputError, match="unpacks to"):
-        huggingface.read(folder, hand="barrett", obj="block")
-
-
-def test_grasps_of_another_kind_of_scene_are_refused(folder: Path, tmp_path: Path) -> None:
-    rows = [row | {"scene_kind": "bin"} for row in rows_of(folder, "grasps", "block")]
-    pq.write_table(parquet.import_pyarrow().Table.from_pylist(rows), tmp_path / "x.parquet")
-    with pytest.raises(InputError, match="kind 'bin'; use table or free"):
-        huggingface.read(tmp_path / "x.parquet", hand="barrett", obj="block")
 
 
 def test_the_package_itself_reads_the_folder(folder: Path, tmp_path: Path, stored) -> None:

@@ -213,7 +213,7 @@ def test_no_word_lies_on_another_or_on_a_point_or_outside(crowd: str) -> None:
 def test_a_word_alone_stands_close_to_its_point() -> None:
     axes, (word,) = drawn([(10.0, 0.5)])
     box, point = word.get_window_extent(), axes.transData.transform((10.0, 0.5))
-    assert word.arrow_patch is None and 0 < box.x0 - point[0] < 15 and 0 < box.y0 - point[1] < 15
+    assert not axes.patches and 0 < box.x0 - point[0] < 15 and 0 < box.y0 - point[1] < 15
 
 
 @pytest.fixture(scope="module")

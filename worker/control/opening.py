@@ -105,7 +105,14 @@ class Openings:
             for way in depth[1:]:
                 way.run()
             if blocked is not None:
-                jams.blocked.assign(self._blocked(jams, blocked))
+                rows = np.flatnonzero(jams.going.numpy())
+                out = np.zeros((self.count, self.fingers_count), np.int32)
+                if len(rows):
+                    finger = fingers_of_dofs(self.posing.hand)
+                    share = np.where(finger >= 0, jams.share.numpy()[rows][:, finger], 1.0)
+                    move = (self.open.numpy()[rows] - self.q[rows]) * share
+                    out[rows] = blocked(rows, self.q[rows, None] + np.array(WAY)[None, :, None] * move[:, None])
+                jams.blocked.assign(out)
             less = wp.float64(0.5 if look < JAM_LOOKS - 1 else 0.0)
             self._launch(jamming.shorten_paths, self.count, [less], [jams])
         self._launch(jamming.write_path, self.open.shape, [self.fingers, self.hands, jams], [self.open])
@@ -195,16 +202,6 @@ class Openings:
             out.add(jamming.finger_depth, (self.count, posing.hand.bodies), inputs=inputs, outputs=[jams])
             found.append(out)
         return found
-
-    def _blocked(self, jams: Any, blocked: Blocked) -> NDArray[np.int32]:
-        rows = np.flatnonzero(jams.going.numpy())
-        out = np.zeros((self.count, self.fingers_count), np.int32)
-        if len(rows):
-            finger = fingers_of_dofs(self.posing.hand)
-            share = np.where(finger >= 0, jams.share.numpy()[rows][:, finger], 1.0)
-            move = (self.open.numpy()[rows] - self.q[rows]) * share
-            out[rows] = blocked(rows, self.q[rows, None] + np.array(WAY)[None, :, None] * move[:, None])
-        return out
 
 
 def _fingers(hand: HandModel) -> Any:

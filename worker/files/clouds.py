@@ -33,22 +33,18 @@ def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[
     done = {"files": 0, "clouds": 0, "empty": 0}
     for _, samples in groupby(clouds, key=lambda sample: sample["shard_id"]):
         together = list(samples)
-        np.savez_compressed(folder / f"clouds-{done['files']:05}.npz", **stack_samples(together))
+        found: dict[str, Any] = {name: np.array(str(together[0][name])) for name in _WORDS}
+        found["grasp/count"] = np.array([len(sample["grasp/base_row"]) for sample in together], np.int32)
+        for name in together[0]:
+            if name not in _WORDS:
+                values = [sample[name] for sample in together]
+                found[name] = np.concatenate(values) if name.startswith(OF_GRASPS) else np.stack(values)
+        np.savez_compressed(folder / f"clouds-{done['files']:05}.npz", **found)
         done["files"] += 1
         done["clouds"] += len(together)
         done["empty"] += sum(sample["cloud/seen"] == 0 for sample in together)
     (folder / "clouds.json").write_text(json.dumps({**said, **done}, indent=1) + "\n")
     return done
-
-
-def stack_samples(samples: list[dict[str, Any]]) -> dict[str, Any]:
-    found: dict[str, NDArray[Any]] = {name: np.array(str(samples[0][name])) for name in _WORDS}
-    found["grasp/count"] = np.array([len(sample["grasp/base_row"]) for sample in samples], np.int32)
-    for name in samples[0]:
-        if name not in _WORDS:
-            values = [sample[name] for sample in samples]
-            found[name] = np.concatenate(values) if name.startswith(OF_GRASPS) else np.stack(values)
-    return found
 
 
 #: Number of points on a hand: about 5 mm apart on a hand of human size.

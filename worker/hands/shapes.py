@@ -50,7 +50,17 @@ def make_pieces(
             name = find_mesh(shape.filename, files, base, link)
             key = (name, shape.size)
             if key not in hulls:
-                hulls[key] = _mesh_hulls(name, shape.size, files[name], link)
+                try:
+                    soup = read_mesh(name, files[name])
+                except MeshError as error:
+                    raise HandError(f"collision mesh of link {link!r}: {error}") from None
+                points = soup.vertices * np.asarray(shape.size)
+                if np.ptp(points, axis=0).max() > MAX_PIECE_M:
+                    raise HandError(
+                        f"collision mesh {name!r} of link {link!r} is {np.ptp(points, axis=0).max():.3g} m long; "
+                        'if it is in millimetres give it scale="0.001 0.001 0.001"'
+                    )
+                hulls[key] = _reduced_hulls(points, soup.faces.astype(np.int32))
             found = hulls[key]
     except HandError as error:
         if repr(link) in str(error):
@@ -60,21 +70,6 @@ def make_pieces(
         ConvexPiece(body, "hull", (), IDENTITY_POSE.copy(), apply(pose, vertices), faces, link)
         for vertices, faces in found
     ]
-
-
-def _mesh_hulls(name: str, scale: tuple[float, ...], data: bytes, link: str) -> list[tuple[Floats, Ints]]:
-    """Return the hulls of a mesh file; HandError if the mesh is unreadable or longer than `MAX_PIECE_M`."""
-    try:
-        soup = read_mesh(name, data)
-    except MeshError as error:
-        raise HandError(f"collision mesh of link {link!r}: {error}") from None
-    points = soup.vertices * np.asarray(scale)
-    if np.ptp(points, axis=0).max() > MAX_PIECE_M:
-        raise HandError(
-            f"collision mesh {name!r} of link {link!r} is {np.ptp(points, axis=0).max():.3g} m long; "
-            'if it is in millimetres give it scale="0.001 0.001 0.001"'
-        )
-    return _reduced_hulls(points, soup.faces.astype(np.int32))
 
 
 def _reduced_hulls(points: Floats, faces: Ints) -> list[tuple[Floats, Ints]]:

@@ -39,21 +39,17 @@ def _read_link(element: Element, materials: dict[str, Colour | None]) -> Link:
     mass = None if mass_element is None else _parse_number(mass_element, "value", f"mass of link {name!r}")
     if mass is not None and mass < 0:
         raise HandError(f"mass of link {name!r} is negative; give it in kilograms")
-    return Link(name, shapes, mass if mass else None, _read_visuals(element, name, materials))
-
-
-def _read_visuals(element: Element, link: str, materials: dict[str, Colour | None]) -> tuple[Shape, ...]:
-    """Read visual elements; unusable ones are left out, since only pictures need them."""
+    # Unusable visual elements are left out, since only pictures need them.
     found = []
     for visual in element.findall("visual")[:MAX_VISUALS]:
         try:
-            shape = _read_shape(visual, f"visual of link {link!r}")
+            shape = _read_shape(visual, f"visual of link {name!r}")
         except HandError:
             continue
         material = visual.find("material")
         colour = None if material is None else _colour(material) or materials.get(material.get("name", ""))
         found.append(replace(shape, colour=colour))
-    return tuple(found)
+    return Link(name, shapes, mass if mass else None, tuple(found))
 
 
 def _colour(material: Element) -> Colour | None:
@@ -103,27 +99,24 @@ def _read_joint(element: Element, notes: list[str]) -> Joint:
     if kind == "fixed":
         return still
     try:
-        return _movable_joint(element, still, what, notes)
+        if still.type not in MOVING:
+            raise HandError(
+                f"{what}: type {still.type[:40]!r} cannot be used; use revolute, prismatic and fixed joints"
+            )
+        mimic = _mimic(element, what)
+        try:
+            lower, upper, effort = _limits(element, still.type, what)
+        except HandError:
+            # A follower's limits do not bind it, so wrong ones do not matter.
+            if mimic is None:
+                raise
+            most = UNLIMITED_M if still.type == "prismatic" else math.pi
+            lower, upper, effort = -most, most, 0.0
+        axis, velocity = _axis(element, what, notes), _velocity_limit(element)
+        return replace(still, axis=axis, lower=lower, upper=upper, effort=effort, mimic=mimic, velocity=velocity)
     except HandError as error:
         # The fault only matters if the hand moves by this joint.
         return replace(still, fault=str(error))
-
-
-def _movable_joint(element: Element, still: Joint, what: str, notes: list[str]) -> Joint:
-    """Return the joint with its axis and limits; raise HandError if no hand can have it."""
-    if still.type not in MOVING:
-        raise HandError(f"{what}: type {still.type[:40]!r} cannot be used; use revolute, prismatic and fixed joints")
-    mimic = _mimic(element, what)
-    try:
-        lower, upper, effort = _limits(element, still.type, what)
-    except HandError:
-        # A follower's limits do not bind it, so wrong ones do not matter.
-        if mimic is None:
-            raise
-        most = UNLIMITED_M if still.type == "prismatic" else math.pi
-        lower, upper, effort = -most, most, 0.0
-    axis, velocity = _axis(element, what, notes), _velocity_limit(element)
-    return replace(still, axis=axis, lower=lower, upper=upper, effort=effort, mimic=mimic, velocity=velocity)
 
 
 def _velocity_limit(element: Element) -> float:

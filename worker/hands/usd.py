@@ -66,7 +66,11 @@ class _Reader:
         used = dict.fromkeys(path for joint in ordered.values() for path in joint["bodies"])
         if not used:
             raise HandError(f"{self.main}: no physics joint between rigid bodies; give an articulated hand")
-        self._check_size(used)
+        shapes = [shape for path in used for shape in self._shapes(path, "collider")]
+        points = np.concatenate([self.stage.mesh(shape)[0] for shape in shapes] or [np.zeros((0, 3))])
+        size = float(np.ptp(points, axis=0).max()) if len(points) else _MIN_LENGTH_M
+        if not _MIN_LENGTH_M <= size <= MAX_LENGTH_M:
+            raise HandError(f"{self.main}: the hand would be {size:.3g} m long; correct metersPerUnit of the stage")
         links, joints = [self._link(path) for path in used], list[Joint]()
         for joint in (ordered[one["path"]] for one in self.joints if one["path"] in ordered):
             made = self._joint(joint)
@@ -216,13 +220,6 @@ class _Reader:
         sizes = shape["size"] * 3 if kind == "box" else shape["size"]
         lengths = np.array(sizes) * (scale if kind == "box" else scale[[0, 2]][: len(sizes)]) * self.stage.unit
         return Shape(kind, tuple(map(float, lengths)), compose(frame, self._rigid(matrix)))
-
-    def _check_size(self, used: Mapping[str, Any]) -> None:
-        shapes = [shape for path in used for shape in self._shapes(path, "collider")]
-        points = np.concatenate([self.stage.mesh(shape)[0] for shape in shapes] or [np.zeros((0, 3))])
-        size = float(np.ptp(points, axis=0).max()) if len(points) else _MIN_LENGTH_M
-        if not _MIN_LENGTH_M <= size <= MAX_LENGTH_M:
-            raise HandError(f"{self.main}: the hand would be {size:.3g} m long; correct metersPerUnit of the stage")
 
 
 def _stated(value: float) -> float:

@@ -45,7 +45,10 @@ def intersecting_faces(vertices: Floats, faces: Indices) -> Indices | None:
     if tree.count_neighbors(tree, 2 * radius) > 2 * MAX_PAIRS:
         return None
     near = owner[tree.query_pairs(2 * radius, output_type="ndarray")]
-    near = _unique_pairs(near[(near[:, 0] != near[:, 1]) & _box_overlap_mask(corners, near)], len(faces))
+    pairs = near[(near[:, 0] != near[:, 1]) & _box_overlap_mask(corners, near)]
+    # Each unordered pair counts once; pairs encoded as one number sort many times faster than rows.
+    keys = np.unique(pairs.min(axis=1) * np.int64(len(faces)) + pairs.max(axis=1))
+    near = np.stack(np.divmod(keys, len(faces)), axis=1)
     apart = ~(faces[near[:, 0]][:, :, None] == faces[near[:, 1]][:, None, :]).any(axis=(1, 2))
     near = near[apart]
     depth = DEPTH * float(np.ptp(vertices, axis=0).max())
@@ -55,13 +58,6 @@ def intersecting_faces(vertices: Floats, faces: Indices) -> Indices | None:
         for part in np.array_split(near, max(1, len(near) // _CHUNK))
     ]
     return near[np.concatenate(found)]
-
-
-def _unique_pairs(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Return unordered pairs (P, 2) of numbers below `count` once each, in ascending order.
-    Pairs encoded as one number sort many times faster than rows."""
-    keys = np.unique(pairs.min(axis=1) * np.int64(count) + pairs.max(axis=1))
-    return np.stack(np.divmod(keys, count), axis=1)
 
 
 def _box_overlap_mask(corners: Floats, pairs: Indices) -> NDArray[np.bool_]:

@@ -25,7 +25,16 @@ def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_b
     if not text:
         raise HandError(f"{name} is empty; export it again")
     try:
-        tree = _parse_with_prefixes(text)
+        try:
+            tree: Element = SafeTree.fromstring(text)
+        except ParseError as error:
+            # Undeclared prefixes of foreign elements (`drake:...`) are declared here.
+            first = _FIRST.search(text)
+            if "unbound prefix" not in str(error) or first is None:
+                raise
+            prefixes = sorted(set(_PREFIX.findall(text)) - {"xml", "xmlns"})
+            declared = "".join(f' xmlns:{prefix}="urn:{prefix}"' for prefix in prefixes[:_MAX_PREFIXES])
+            tree = SafeTree.fromstring(text[: first.end()] + declared + text[first.end() :])
     except DefusedXmlException:
         raise HandError(f"{name}: XML entities are refused; write the text out") from None
     except (ParseError, ValueError, LookupError) as error:
@@ -36,18 +45,4 @@ def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_b
     if space:
         for element in tree.iter():
             element.tag = element.tag.removeprefix(space + "}")
-    return tree
-
-
-def _parse_with_prefixes(text: str) -> Element:
-    """Parse an XML text; undeclared prefixes of foreign elements (`drake:...`) are declared here."""
-    try:
-        tree: Element = SafeTree.fromstring(text)
-    except ParseError as error:
-        first = _FIRST.search(text)
-        if "unbound prefix" not in str(error) or first is None:
-            raise
-        prefixes = sorted(set(_PREFIX.findall(text)) - {"xml", "xmlns"})
-        declared = "".join(f' xmlns:{prefix}="urn:{prefix}"' for prefix in prefixes[:_MAX_PREFIXES])
-        tree = SafeTree.fromstring(text[: first.end()] + declared + text[first.end() :])
     return tree

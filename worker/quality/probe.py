@@ -177,9 +177,14 @@ class Probe:
     def measure(self, posture: Posture) -> Distances:
         """Measure all distances of B postures from the object, within `REACH_M`."""
         found = self.nearest_points(posture)
+        with wp.ScopedDevice(self.device):
+            least = wp.full((len(found.bodies), len(self._piece_body)), REACH_M, dtype=wp.float32)
+            inputs = [*self._posed_pieces(found.bodies), REACH_M, self._samples]
+            dim = (len(found.bodies), len(self.samples))
+            launch(kernels.pieces_distance, dim, inputs=inputs, outputs=[least])
         return Distances(
             **vars(found),
-            piece_distance=self._piece_distances(found.bodies),
+            piece_distance=least.numpy().astype(float),
             self_depth=self.self_depth(found.bodies, found.hand_points).max(axis=1),
         )
 
@@ -209,14 +214,6 @@ class Probe:
             inputs = [*self._posed_pieces(bodies), self._body, own]
             launch(kernels.self_distance, points.shape[:2], inputs=inputs, outputs=[depth])
         return depth.numpy().astype(float)
-
-    def _piece_distances(self, bodies: Floats) -> Floats:
-        with wp.ScopedDevice(self.device):
-            least = wp.full((len(bodies), len(self._piece_body)), REACH_M, dtype=wp.float32)
-            inputs = [*self._posed_pieces(bodies), REACH_M, self._samples]
-            dim = (len(bodies), len(self.samples))
-            launch(kernels.pieces_distance, dim, inputs=inputs, outputs=[least])
-        return least.numpy().astype(float)
 
     def _posed_pieces(self, bodies: Floats) -> list[Any]:
         frames = compose(bodies[:, self._piece_body], self._piece_frame[None])

@@ -160,7 +160,21 @@ def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: Mask) -> tu
     scale = np.abs(points).max(axis=(1, 2))
     joggle = np.random.default_rng(0).uniform(-1.0, 1.0, points.shape[1:]) * JOGGLE
     points = np.where(own[..., None], points + joggle * scale[:, None, None], 0.0)
-    corners, flat = _simplices(points, own, number)
+    rows = np.arange(len(points))
+    mean = points.sum(axis=1) / number[:, None]
+    far = np.where(own, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)
+    chosen = [np.argmax(far, axis=1)]
+    rest = np.where(own[..., None], points - points[rows, chosen[0]][:, None], 0.0)
+    lengths = []
+    for _ in range(_DIMENSION):
+        square = np.einsum("hpi,hpi->hp", rest, rest)
+        farthest = np.argmax(square, axis=1)
+        length = np.sqrt(square[rows, farthest])
+        axis = rest[rows, farthest] / np.maximum(length, 1e-300)[:, None]
+        rest = rest - np.einsum("hpi,hi->hp", rest, axis)[..., None] * axis[:, None]
+        chosen.append(farthest)
+        lengths.append(length)
+    corners, flat = np.stack(chosen, axis=1), np.min(lengths, axis=0) <= _FLAT * np.max(lengths, axis=0)
     firm = np.flatnonzero(~flat)
     if len(firm):
         found = _grow_hulls(points[firm], number[firm], np.asarray(whole)[some][firm], corners[firm], scale[firm])
@@ -199,26 +213,6 @@ def _grow_hulls(
         found = result.numpy().copy()
     found[found[:, 2] == 0] = np.nan
     return found[:, 0], found[:, 1]
-
-
-def _simplices(points: Floats, own: Mask, count: NDArray[Any]) -> tuple[Ints, Mask]:
-    """Return the corners (H, 7) of simplices, and a mask (H,) of flat hulls.
-    Each corner is the point farthest from the span of earlier corners."""
-    rows = np.arange(len(points))
-    mean = points.sum(axis=1) / count[:, None]
-    far = np.where(own, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)
-    chosen = [np.argmax(far, axis=1)]
-    rest = np.where(own[..., None], points - points[rows, chosen[0]][:, None], 0.0)
-    lengths = []
-    for _ in range(_DIMENSION):
-        square = np.einsum("hpi,hpi->hp", rest, rest)
-        farthest = np.argmax(square, axis=1)
-        length = np.sqrt(square[rows, farthest])
-        axis = rest[rows, farthest] / np.maximum(length, 1e-300)[:, None]
-        rest = rest - np.einsum("hpi,hi->hp", rest, axis)[..., None] * axis[:, None]
-        chosen.append(farthest)
-        lengths.append(length)
-    return np.stack(chosen, axis=1), np.min(lengths, axis=0) <= _FLAT * np.max(lengths, axis=0)
 
 
 def _planes(corner: Floats) -> tuple[Floats, Floats]:

@@ -15,8 +15,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.cameras import Cameras, intrinsics, look_at
 from graspd.worker.rendering.hands import drawn_bodies, hand_parts
-from graspd.worker.rendering.kernels.shading import CATCHER
-from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Lamp, Solid
+from graspd.worker.rendering.scenery import Appearance, CameraShot, Lamp, Solid
 from graspd.worker.rendering.tracer import Tracer
 
 #: Sides 120 degrees apart, measured from the side view of the hand [rad].
@@ -31,8 +30,6 @@ _TOGETHER: Final = 16  # grasps traced together: bounds the memory
 _FILL: Final = 0.86  # share of the picture's width or height that hand and object take up
 #: Direction of the lamp: left of the camera, above it, in front of the object. The camera looks along -x.
 TOWARD_LAMP: Final = np.array([0.45, -0.45, 0.77]) / np.linalg.norm([0.45, -0.45, 0.77])
-FLOOR_SIZE: Final = (6.0, 6.0, 0.02)
-FLOOR: Final = Appearance((1.0, 1.0, 1.0), pattern=CATCHER)
 OBJECT_LOOK: Final = Appearance(linear_rgb_from_hex("#dd7432"), roughness=0.5)
 STUDIO: Final = Lamp(
     key=(1.85, 1.8, 1.7),
@@ -61,7 +58,7 @@ def grasp_pictures(
     obj = obj.centred
     joints = np.atleast_2d(np.asarray(joint_positions, float))
     thing = Solid(obj.vertices, obj.faces, obj.corner_normals)
-    stage = Tracer([Box(FLOOR_SIZE), thing, *(part.solid for part in hand_parts(hand))], run.device)
+    stage = Tracer([thing, *(part.solid for part in hand_parts(hand))], run.device)
     shots = []
     for start in range(0, len(hand_pose), _TOGETHER):
         part = slice(start, start + _TOGETHER)
@@ -83,9 +80,8 @@ def _render_sides(
 ) -> NDArray[np.uint8]:
     worlds, parts = len(bodies), hand_parts(hand)
     points = np.concatenate([np.tile(obj.hull_vertices, (worlds, 1, 1)), hand_points(hand, bodies)], axis=1)
-    still = np.stack([[floor_pose(world), IDENTITY_POSE] for world in points])
-    poses = np.concatenate([still, bodies[:, drawn_bodies(hand)]], axis=1)
-    stage.place(poses, [[FLOOR, OBJECT_LOOK, *(part.look for part in parts)]] * worlds)
+    poses = np.concatenate([np.tile(IDENTITY_POSE, (worlds, 1, 1)), bodies[:, drawn_bodies(hand)]], axis=1)
+    stage.place(poses, [[OBJECT_LOOK, *(part.look for part in parts)]] * worlds)
     k = intrinsics(*size, FIELD_OF_VIEW)
     sides = []
     for azimuth in azimuths:
@@ -93,13 +89,6 @@ def _render_sides(
         cameras = np.stack([_fit_grasp_camera(obj, points[w], angles[w], k, size) for w in range(worlds)])
         sides.append(stage.render(studio_shot(cameras, k, size, angles, samples), run.without_progress()).rgb)
     return np.stack(sides, axis=1)
-
-
-def floor_pose(points: Floats) -> Floats:
-    """Return the pose (7,) of the studio floor, just below points (..., 3)."""
-    pose = IDENTITY_POSE.copy()
-    pose[2] = points[..., 2].min() - 0.01 - 0.5 * FLOOR_SIZE[2]
-    return pose
 
 
 def studio_shot(

@@ -21,7 +21,7 @@ from graspd.worker.objects.topology import from_manifold
 from graspd.worker.rendering import pictures, sheets
 from graspd.worker.rendering.cameras import intrinsics
 from graspd.worker.rendering.hands import drawn_bodies, hand_parts
-from graspd.worker.rendering.scenery import Appearance, Box, Solid
+from graspd.worker.rendering.scenery import Appearance, Solid
 from graspd.worker.rendering.tracer import Tracer
 
 #: Size of one picture of a portrait [px].
@@ -84,10 +84,8 @@ def _render_worlds(
     solids: Sequence[Solid], poses: Floats, looks: list[Appearance], points: Floats, azimuths: ArrayLike
 ) -> NDArray[np.uint8]:
     """Render N worlds (N, H, W, 3), each from its azimuth; every camera frames the same points."""
-    worlds = len(poses)
-    stage = Tracer([Box(pictures.FLOOR_SIZE), *solids], "cpu")
-    floors = np.tile(pictures.floor_pose(points), (worlds, 1, 1))
-    stage.place(np.concatenate([floors, poses], axis=1), [[pictures.FLOOR, *looks]] * worlds)
+    stage = Tracer(solids, "cpu")
+    stage.place(poses, [looks] * len(poses))
     k = intrinsics(*SIZE, pictures.FIELD_OF_VIEW)
     angles = np.asarray(azimuths, float)
     cameras = np.stack([pictures.fit_camera(points, angle, k, SIZE) for angle in angles])

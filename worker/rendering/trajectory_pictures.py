@@ -25,7 +25,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering import pictures as studio
 from graspd.worker.rendering.cameras import intrinsics, look_at
 from graspd.worker.rendering.hands import drawn_bodies, drawn_parts, drawn_poses
-from graspd.worker.rendering.scenery import Appearance, Box, Solid, Supports, slab_poses, slabs, visible_share
+from graspd.worker.rendering.scenery import Appearance, Solid, Supports, slab_poses, slabs, visible_share
 from graspd.worker.rendering.tracer import Tracer
 from graspd.worker.scenes.neighbours import Neighbours
 
@@ -103,11 +103,11 @@ class _GraspRenderer:
         self.around = around = around.centred(obj)
         self.centre, self.obj = np.array(obj.centre), obj.centred
         self.others = around.neighbours.objects if around.neighbours else ()
-        self.boxes = slabs(around.supports) or [Box(studio.FLOOR_SIZE)]
+        self.boxes = slabs(around.supports)
         objects = [Solid(o.vertices, o.faces, o.corner_normals) for o in (self.obj, *self.others)]
         parts = drawn_parts(hand, mounted=around.wrist is not None)
         self.tracer = Tracer([*self.boxes, *objects, *(part.solid for part in parts)], run.device)
-        planes = [_TABLE if isinstance(s, HalfSpace) else _WALL for s in around.supports] or [studio.FLOOR]
+        planes = [_TABLE if isinstance(s, HalfSpace) else _WALL for s in around.supports]
         self.looks = [*planes, studio.OBJECT_LOOK, *(_BESIDE for _ in self.others), *(part.look for part in parts)]
 
     def render(
@@ -126,7 +126,11 @@ class _GraspRenderer:
         middles = 0.5 * (solid.min(axis=1) + solid.max(axis=1))
         reach = float(np.linalg.norm(solid - middles[:, None], axis=2).max()) + self.near_m
         near = points[np.linalg.norm(points - middles[:, None], axis=2) < reach]
-        self._place(scene, things, drawn, studio.floor_pose(points), middles[0])
+        standing = slab_poses(self.around.supports, middles[0], 0.0)
+        beside = self.around.neighbours.poses[scene] if self.around.neighbours else np.zeros((0, 7))
+        poses = np.tile(np.concatenate([standing, things[0][None], beside]), (self.frames, 1, 1))
+        poses[:, len(standing)] = things
+        self.tracer.place(np.concatenate([poses, drawn], axis=1), [self.looks] * self.frames)
         above = middles[0] + np.array([0, 0, _HIGH_M])
         covered = visible_share(self.around.supports, above, middles[:1]) < 1
         lamp = _UNDER_A_BOARD if covered else studio.TOWARD_LAMP
@@ -138,14 +142,6 @@ class _GraspRenderer:
             shot = studio.studio_shot(cameras, k, size, np.full(self.frames, angle), samples, toward_lamp=lamp)
             pictures.append(self.tracer.render(shot, self.run.without_progress()).rgb)
         return np.stack(pictures)
-
-    def _place(self, scene: int, things: Floats, drawn: Floats, floor: Floats, middle: Floats) -> None:
-        standing = slab_poses(self.around.supports, middle, 0.0) if self.around.supports else floor[None]
-        beside = self.around.neighbours.poses[scene] if self.around.neighbours else np.zeros((0, 7))
-        still = np.concatenate([standing, things[0][None], beside])
-        poses = np.tile(still, (self.frames, 1, 1))
-        poses[:, len(standing)] = things
-        self.tracer.place(np.concatenate([poses, drawn], axis=1), [self.looks] * self.frames)
 
     def _best_sides(self, world: int, near: Floats, first: float, count: int) -> list[tuple[float, float]]:
         """Return azimuth and height [rad] of the sides that show most, apart from one another.

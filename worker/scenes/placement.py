@@ -125,7 +125,11 @@ def _scenes_of(
         require_no_penetration(other, poses["scene/neighbour_pose"][:, number], supports)
     if given:
         whole = np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
-        _check_apart([neighbour_of(obj), *beside], whole)
+        things = [neighbour_of(obj), *beside]
+        for (a, b), gap in gaps_between(things, whole).items():
+            if -gap.min() > SUNK:
+                overlap = f"overlap by {-1e3 * gap.min():.1f} mm in scene {int(gap.argmin())}; move one of them"
+                raise SceneError(f"{things[a].obj.name} and {things[b].obj.name} {overlap}")
     return Scenes(supports, poses["scene/object_pose"], beside, poses["scene/neighbour_pose"]), poses
 
 
@@ -149,13 +153,6 @@ def _place_objects(
 
     found, beside = place_neighbours(obj, draw_pose, others, supports, within=size, count=len(alone), seed=seed)
     return {**poses, "scene/object_pose": found, "scene/neighbour_pose": beside}
-
-
-def _check_apart(things: Sequence[Neighbour], poses: Floats) -> None:
-    for (a, b), gap in gaps_between(things, poses).items():
-        if -gap.min() > SUNK:
-            overlap = f"overlap by {-1e3 * gap.min():.1f} mm in scene {int(gap.argmin())}; move one of them"
-            raise SceneError(f"{things[a].obj.name} and {things[b].obj.name} {overlap}")
 
 
 def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0.1) -> dict[tuple[int, int], Floats]:
@@ -213,7 +210,12 @@ def enclosing_solid(corners: Floats) -> tuple[Obstacle, float]:
         found.close()
     except QhullError:
         raise MeshError("a convex piece of this object is flat; an object needs some thickness") from None
-    return solid, _protrusion(solid.corners, corners, hull)
+    import trimesh  # slow to load, seldom needed
+
+    mesh = trimesh.Trimesh(corners, hull.simplices, process=False)
+    _, distance, _ = trimesh.proximity.closest_point_naive(mesh, solid.corners)
+    outside = (solid.corners @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1) > 0
+    return solid, float(np.where(outside, distance, 0.0).max(initial=0.0))
 
 
 def _as_qhull(planes: Floats) -> Floats:
@@ -228,13 +230,3 @@ def _corners_and_edges(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
     hull = ConvexHull(points[np.sort(first)])
     corners, triangles = outward_hull(hull.points, hull.simplices, hull.equations[:, :3])
     return corners, convex_edges(corners, triangles)
-
-
-def _protrusion(points: Floats, corners: Floats, hull: Any) -> float:
-    """Return the largest distance of `points` from the hull of `corners` [m], attained at a corner."""
-    import trimesh  # slow to load, seldom needed
-
-    mesh = trimesh.Trimesh(corners, hull.simplices, process=False)
-    _, distance, _ = trimesh.proximity.closest_point_naive(mesh, points)
-    outside = (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1) > 0
-    return float(np.where(outside, distance, 0.0).max(initial=0.0))

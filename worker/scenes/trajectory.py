@@ -99,7 +99,13 @@ def plan_free_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet) ->
     hand_points, object_points = _FREE_POINTS
     probe = probe_of(hand, obj, hand_points=hand_points, object_points=object_points)
     nowhere = PlacedGrasps((), IDENTITY_POSE[None], np.zeros(len(grasps), np.intp))
-    wide = _open_pregrasps(probe, grasps.pregrasp, wide_open_joints(hand, obj, grasps.pregrasp, nowhere))
+    joints = wide_open_joints(hand, obj, grasps.pregrasp, nowhere)
+    start = np.asarray(grasps.pregrasp.joint_positions, float)
+    room = np.minimum(OBJECT_MARGIN_M, _object_distances(probe, grasps.pregrasp)) - 5e-4
+    nearer = np.zeros(len(start), bool)
+    for share in (1 / 3, 2 / 3, 1.0):
+        nearer |= _object_distances(probe, Posture(grasps.pregrasp.hand_pose, start + share * (joints - start))) < room
+    wide = Posture(np.array(grasps.pregrasp.hand_pose, float), np.where(nearer[:, None], start, joints))
     pointing = quat_rotate(wide.hand_pose[:, 3:], hand.palm.approach)
     ways = [-pointing, *(_tilt_axes(-pointing, tilt, side) for tilt in TILTS for side in range(SIDES))]
     path, _, touching, chosen = _plan_approach(probe, wide, nowhere.scenes[0], ways)
@@ -109,16 +115,6 @@ def plan_free_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet) ->
     endless = np.full(len(grasps), np.inf)
     still, _ = choose_wrist(hand, path[:, -1:], nowhere.scenes)
     return Trajectory(path, wide.joint_positions, lift, endless, endless, endless, endless, touching, still, endless)
-
-
-def _open_pregrasps(probe: Probe, pregrasp: Posture, joints: Floats) -> Posture:
-    """Return pregrasps opened to `joints` (n, J), unless that moves the fingers closer to the object."""
-    start = np.asarray(pregrasp.joint_positions, float)
-    room = np.minimum(OBJECT_MARGIN_M, _object_distances(probe, pregrasp)) - 5e-4
-    nearer = np.zeros(len(start), bool)
-    for share in (1 / 3, 2 / 3, 1.0):
-        nearer |= _object_distances(probe, Posture(pregrasp.hand_pose, start + share * (joints - start))) < room
-    return Posture(np.array(pregrasp.hand_pose, float), np.where(nearer[:, None], start, joints))
 
 
 def _unit(ways: Floats, instead: Floats) -> Floats:

@@ -59,7 +59,21 @@ class DeviceHand:
             tree.joint_type = wp.array(hand.joint_type, dtype=wp.int32)
             tree.pivot = wp.vec3(*hand.palm.centre)
             lower, upper = (wp.array(limit, dtype=wp.float32) for limit in (hand.lower, hand.upper))
-            return cls(hand, device, tree, _device_pieces(hand), lower, upper)
+            out = pieces.Pieces()
+            size, position, rotation, half, planes = zip(*map(_piece_row, hand.pieces), strict=True)
+            apart = np.ones((hand.bodies, hand.bodies), dtype=np.int32) - np.eye(hand.bodies, dtype=np.int32)
+            for a, b in hand.neighbours:
+                apart[a, b] = apart[b, a] = 0
+            out.body = wp.array([p.body for p in hand.pieces], dtype=wp.int32)
+            out.kind = wp.array([_KINDS[p.kind] for p in hand.pieces], dtype=wp.int32)
+            out.size = wp.array(np.array(size), dtype=wp.vec3)
+            out.pose_p = wp.array(np.array(position), dtype=wp.vec3)
+            out.pose_q = wp.array(to_xyzw(np.array(rotation)), dtype=wp.quat)
+            out.half = wp.array(np.array(half), dtype=wp.vec3)
+            out.first_plane = wp.array(np.cumsum([0, *map(len, planes)]), dtype=wp.int32)
+            out.planes = wp.array(np.concatenate([*planes, np.zeros((1, 4))]), dtype=wp.vec4)
+            out.apart = wp.array(apart, dtype=wp.int32)
+            return cls(hand, device, tree, out, lower, upper)
 
 
 def _add_joints(out: Any, hand: HandModel, vector: Any, quaternion: Any, number: Any) -> None:
@@ -67,24 +81,6 @@ def _add_joints(out: Any, hand: HandModel, vector: Any, quaternion: Any, number:
     out.origin_p, out.axis = (wp.array(rows, dtype=vector) for rows in (hand.origin[:, :3], hand.axis))
     out.origin_q = wp.array(to_xyzw(hand.origin[:, 3:]), dtype=quaternion)
     out.multiplier, out.offset = (wp.array(values, dtype=number) for values in (hand.multiplier, hand.offset))
-
-
-def _device_pieces(hand: HandModel) -> Any:
-    out = pieces.Pieces()
-    size, position, rotation, half, planes = zip(*map(_piece_row, hand.pieces), strict=True)
-    apart = np.ones((hand.bodies, hand.bodies), dtype=np.int32) - np.eye(hand.bodies, dtype=np.int32)
-    for a, b in hand.neighbours:
-        apart[a, b] = apart[b, a] = 0
-    out.body = wp.array([p.body for p in hand.pieces], dtype=wp.int32)
-    out.kind = wp.array([_KINDS[p.kind] for p in hand.pieces], dtype=wp.int32)
-    out.size = wp.array(np.array(size), dtype=wp.vec3)
-    out.pose_p = wp.array(np.array(position), dtype=wp.vec3)
-    out.pose_q = wp.array(to_xyzw(np.array(rotation)), dtype=wp.quat)
-    out.half = wp.array(np.array(half), dtype=wp.vec3)
-    out.first_plane = wp.array(np.cumsum([0, *map(len, planes)]), dtype=wp.int32)
-    out.planes = wp.array(np.concatenate([*planes, np.zeros((1, 4))]), dtype=wp.vec4)
-    out.apart = wp.array(apart, dtype=wp.int32)
-    return out
 
 
 def _piece_row(piece: ConvexPiece) -> tuple[Floats, Floats, Floats, Floats, Floats]:

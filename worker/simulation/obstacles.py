@@ -85,7 +85,17 @@ def body_clearance(
     exact from half-spaces, and from solids that the hand does not penetrate; near edges and corners of solids, those of
     links with hulls are lower bounds. Distances from solids are at most `FAR_M`."""
     which = np.zeros(len(postures), np.int32) if which is None else np.asarray(which, np.int32)
-    out = _half_space_clearance(hand, postures, scenes, which)
+    every = [[o for o in scene.obstacles if not len(o.corners)] for scene in scenes]
+    flat, count = [o for one in every for o in one], len(postures)
+    bodies, spaces = posed_bodies(hand, postures.hand_pose, postures.joint_positions), chain_kernels.HalfSpaces()
+    with wp.ScopedDevice("cpu"):
+        spaces.first = wp.array(np.cumsum([0, *map(len, every)]), dtype=wp.int32)
+        spaces.planes = wp.array(np.concatenate([np.zeros((0, 4)), *(o.planes for o in flat)]), dtype=wp.vec4d)
+        spaces.more = wp.array([_extra_margin(o) for o in flat], dtype=wp.float64)
+        room = wp.full((count, hand.bodies), np.inf, dtype=wp.float64)
+        inputs = [chain_of(hand, "cpu"), spaces, wp.array(which, dtype=wp.int32), bodies.position, bodies.rotation]
+        launch(chain_kernels.half_space_clearance, (count, hand.bodies), inputs=inputs, outputs=[room], device="cpu")
+    out = np.asarray(room.numpy())
     tips = np.isin(np.arange(hand.bodies), hand.fingertips)
     for number, scene in enumerate(scenes):
         solids = [o for o in scene.obstacles if len(o.corners)]
@@ -98,22 +108,6 @@ def body_clearance(
 
 def _extra_margin(obstacle: Obstacle) -> float:
     return 0.0 if obstacle.tips_m is None else CLEAR_M - obstacle.tips_m
-
-
-def _half_space_clearance(
-    hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]]
-) -> Floats:
-    every = [[o for o in scene.obstacles if not len(o.corners)] for scene in scenes]
-    flat, count = [o for one in every for o in one], len(postures)
-    bodies, spaces = posed_bodies(hand, postures.hand_pose, postures.joint_positions), chain_kernels.HalfSpaces()
-    with wp.ScopedDevice("cpu"):
-        spaces.first = wp.array(np.cumsum([0, *map(len, every)]), dtype=wp.int32)
-        spaces.planes = wp.array(np.concatenate([np.zeros((0, 4)), *(o.planes for o in flat)]), dtype=wp.vec4d)
-        spaces.more = wp.array([_extra_margin(o) for o in flat], dtype=wp.float64)
-        room = wp.full((count, hand.bodies), np.inf, dtype=wp.float64)
-        inputs = [chain_of(hand, "cpu"), spaces, wp.array(which, dtype=wp.int32), bodies.position, bodies.rotation]
-        launch(chain_kernels.half_space_clearance, (count, hand.bodies), inputs=inputs, outputs=[room], device="cpu")
-    return np.asarray(room.numpy())
 
 
 def obstacle_clearance(

@@ -43,16 +43,6 @@ class ProjectionOptions:
     step: float = 3e-3  # largest step in units of the scaled variables [m]
 
 
-def _allocate_residuals(capacity: int, each: int) -> Any:
-    out = kernels.Residuals()
-    out.count = wp.zeros(capacity, dtype=wp.int32)
-    shape = (capacity, each)
-    out.body, out.other = (wp.empty(shape, dtype=wp.int32) for _ in range(2))
-    out.point, out.direction = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
-    out.value, out.weight = (wp.empty(shape, dtype=wp.float32) for _ in range(2))
-    return out
-
-
 class Projection:
     """Projection of a model's hands that selects the least penetrating state of each on the device."""
 
@@ -65,7 +55,12 @@ class Projection:
         scale = np.repeat(options.scale, [3, 3, model.dofs])
         scale[6:] *= data.unit
         with wp.ScopedDevice(model.device):
-            self.residuals = _allocate_residuals(B, each)
+            out = self.residuals = kernels.Residuals()
+            out.count = wp.zeros(B, dtype=wp.int32)
+            shape = (B, each)
+            out.body, out.other = (wp.empty(shape, dtype=wp.int32) for _ in range(2))
+            out.point, out.direction = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
+            out.value, out.weight = (wp.empty(shape, dtype=wp.float32) for _ in range(2))
             self._row = wp.empty((B * self._lanes, n), dtype=wp.float32)
             self.matrix, self.vector = wp.zeros((B, n, n), dtype=wp.int64), wp.zeros((B, n), dtype=wp.int64)
             self._factor, self._move = wp.empty((B, n, n), dtype=wp.float64), wp.empty((B, n), dtype=wp.float64)
@@ -82,7 +77,10 @@ class Projection:
         self._depth.fill_(np.inf)
         step = self._record_depths(now, best)
         self._add_equations(step)
-        self._add_step(step, now)
+        d, o = self.data, self.options
+        inputs = [*self._limits, self._scale, wp.float64(o.damping), wp.float64(o.step), self.residuals]
+        outputs = [self._factor, self._move, self.matrix, self.vector, now, d.hands]
+        step.add(kernels.step, d.capacity, inputs=inputs, outputs=outputs)
         step.run(iterations)
         self._record_depths(now, best).run()
         pivot, rotation, q = (array.numpy()[:n].copy() for array in (best.pivot, best.rotation, best.q))
@@ -125,9 +123,3 @@ class Projection:
         inputs = [m.hand.tree, self._lane, d.hands, self.residuals]
         outputs = [self._row, self.matrix, self.vector]
         out.add(kernels.normal_equations, (d.capacity, self._lanes), inputs=inputs, outputs=outputs)
-
-    def _add_step(self, out: Launches, now: Any) -> None:
-        d, o = self.data, self.options
-        inputs = [*self._limits, self._scale, wp.float64(o.damping), wp.float64(o.step), self.residuals]
-        outputs = [self._factor, self._move, self.matrix, self.vector, now, d.hands]
-        out.add(kernels.step, d.capacity, inputs=inputs, outputs=outputs)

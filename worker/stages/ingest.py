@@ -73,7 +73,8 @@ def check_in_child(
     cpu_s: int = CPU_LIMIT_S,
 ) -> tuple[dict[str, Any], bytes]:
     """Check an upload; return the result (a refusal if the check crashed) and the model for viewers.
-    The model (glTF) is empty after a refusal, for a network, or if making it would take too long.
+    The model (glTF) of an object of wrong size is in the likeliest units. It is empty after any other refusal, for a
+    network, or if making it would take too long.
     Raises OSError: the check was killed, or the disk is full. TaskCancelled: the task should stop."""
     with tempfile.TemporaryDirectory(prefix="graspd-ingest-") as folder:
         source, target, errors = (Path(folder) / file for file in ("files.zip", "check.json", "errors.txt"))
@@ -157,7 +158,11 @@ def _check_upload(kind: str, name: str, source: str, target: str, memory_bytes: 
 
         found = check_object(files, name)
     Path(target).write_text(json.dumps(found))
-    if found["verdict"] != "refuse" and kind != AssetKind.NETWORK and time.process_time() < _MODEL_CPU_S:
+    if units := found["facts"].get("units_suggested"):
+        # The refused file is shown in the likeliest units.
+        stated = json.loads(files.get("asset.json", b"{}")) | {"units": units[0]}
+        files = {**files, "asset.json": json.dumps(stated).encode()}
+    if (found["verdict"] != "refuse" or units) and kind != AssetKind.NETWORK and time.process_time() < _MODEL_CPU_S:
         from graspd.worker.stages.models import model_glb
 
         # The result is kept even if its model cannot be made.

@@ -25,7 +25,7 @@ from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.model import HandModel, JointType
 from graspd.worker.hands.robot import Ints
 from graspd.worker.hands.surface import sample_surface
-from graspd.worker.hands.visuals import VisualMesh, thin_mesh
+from graspd.worker.hands.visuals import thin_mesh
 from graspd.worker.objects.glb_document import Document, rounded_values
 from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.objects.model import ObjectModel
@@ -79,7 +79,11 @@ def hand_glb(hand: HandModel) -> bytes:
             node["rotation"] = rounded_values(np.roll(hand.origin[body, 3:], -1))  # glTF: x y z w
             kind = "prismatic" if hand.joint_type[body] == JointType.PRISMATIC else "revolute"
             node["extras"] |= {"joint": joint_of_body[body], "type": kind, "axis": rounded_values(hand.axis[body])}
-        primitives = _body_primitives(document, hand, body, visuals)
+        meshes: list[tuple[Floats, Ints, Colour | None]] = [
+            (mesh.vertices, mesh.faces, mesh.colour) for mesh in visuals if mesh.body == body
+        ]
+        primitive = _join_meshes(document, meshes) if meshes else _piece_primitive(document, hand, body)
+        primitives = [primitive] if primitive else []
         if any(mesh.body == body for mesh in visuals) and (pieces := _piece_primitive(document, hand, body)):
             node["extras"]["collision"] = document.add_mesh([pieces])
         if (on_body := points.position[points.body == body]).size:
@@ -99,7 +103,8 @@ def object_glb(obj: ObjectModel) -> bytes:
     """Return the prepared mesh as glTF [m]; its node is translated to the middle, for 32-bit coordinates."""
     document = Document()
     primitive = document.add_triangles(obj.centred.vertices, obj.faces, obj.corner_normals)
-    extras = {"kind": "object", "name": obj.name, "centre_of_mass": rounded_values(obj.centre_of_mass)}
+    extras: dict[str, Any] = {"kind": "object", "name": obj.name, "centre_of_mass": rounded_values(obj.centre_of_mass)}
+    extras |= {"extents_m": rounded_values(np.ptp(obj.vertices, axis=0)), "mass_kg": obj.mass}
     node = {"name": obj.name, "mesh": document.add_mesh([primitive]), "translation": list(obj.centre)}
     return document.to_bytes([node], extras)
 
@@ -119,17 +124,6 @@ def _document_facts(hand: HandModel) -> dict[str, Any]:
 
 def _piece_primitive(document: Document, hand: HandModel, body: int) -> dict[str, Any] | None:
     return _join_meshes(document, [(p.vertices, p.faces, None) for p in hand.pieces if p.body == body])
-
-
-def _body_primitives(
-    document: Document, hand: HandModel, body: int, visuals: tuple[VisualMesh, ...]
-) -> list[dict[str, Any]]:
-    """Return a body's coloured visual meshes, or else its pieces, which viewers colour."""
-    meshes: list[tuple[Floats, Ints, Colour | None]] = [
-        (mesh.vertices, mesh.faces, mesh.colour) for mesh in visuals if mesh.body == body
-    ]
-    primitive = _join_meshes(document, meshes) if meshes else _piece_primitive(document, hand, body)
-    return [primitive] if primitive else []
 
 
 def _join_meshes(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]) -> dict[str, Any] | None:

@@ -1,7 +1,7 @@
 """Tasks of several batches: each batch is made as if alone, and a shard concatenates their rows."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any, Final
 
@@ -59,21 +59,7 @@ def join_outputs(message: TaskMessage, made: Sequence[Output], *, base_rows: Seq
     attributes = {**made[0].attributes}
     if kind == "base":
         attributes["batch_rows"] = json_attribute([len(part["grasp/hand_pose"]) for part in parts])
-    return Output(columns, attributes, _combine_records([output.info for output in made]))
-
-
-def base_rows(base: Shard, message: TaskMessage) -> list[range]:
-    """Return each batch's rows in a task's base shard. Raises DamagedShard: the shard has other batches."""
-    stored = base.attributes.get("batch_rows")
-    counts = [len(base.arrays["grasp/hand_pose"])] if stored is None else json.loads(str(stored))
-    if len(counts) != len(sizes_of(message)):
-        raise DamagedShard(f"shard {message.inputs[0]} has {len(counts)} batches, not {len(sizes_of(message))}")
-    return [range(start, start + count) for start, count in zip(_start_offsets(counts), counts, strict=True)]
-
-
-def _combine_records(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Combine the records of several batches.
-    Counts and seconds are summed, shares averaged with the planned grasps as weights; others are the first batch's."""
+    records = [output.info for output in made]
     found = dict(records[0])
     planned = [record.get("planned", 0) for record in records]
     for name, value in records[0].items():
@@ -85,7 +71,16 @@ def _combine_records(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         elif isinstance(value, dict) and all(isinstance(count, int) for count in value.values()):
             keys = dict.fromkeys(key for counts in values for key in counts)
             found[name] = {key: sum(counts.get(key, 0) for counts in values) for key in keys}
-    return found
+    return Output(columns, attributes, found)
+
+
+def base_rows(base: Shard, message: TaskMessage) -> list[range]:
+    """Return each batch's rows in a task's base shard. Raises DamagedShard: the shard has other batches."""
+    stored = base.attributes.get("batch_rows")
+    counts = [len(base.arrays["grasp/hand_pose"])] if stored is None else json.loads(str(stored))
+    if len(counts) != len(sizes_of(message)):
+        raise DamagedShard(f"shard {message.inputs[0]} has {len(counts)} batches, not {len(sizes_of(message))}")
+    return [range(start, start + count) for start, count in zip(_start_offsets(counts), counts, strict=True)]
 
 
 def _start_offsets(counts: Sequence[int]) -> list[int]:

@@ -95,7 +95,22 @@ def piece_file(obj: ObjectModel, cache: Path | None = None) -> Path:
 def _load_or_make(obj: ObjectModel, file: Path) -> ConvexPieces:
     parts = convex.load_parts(file) if file.is_file() else None
     if parts is None:
-        parts = _decompose_to_limit(obj)
+        best: tuple[Floats, ...] = (obj.hull_vertices,)
+        excess = _mean_excess_m(union_volume(best), obj)
+        for threshold in THRESHOLDS:
+            if excess <= GOOD_EXCESS_M:
+                break
+            try:
+                made = convex.coacd_parts(obj.vertices, obj.faces, {"threshold": threshold, **_COACD}, CPU_S)
+            except WorkLimitExceeded as error:
+                name = obj.name or "an object"
+                log.warning("%s: more than %d pieces need %s; the coarser ones are used", name, len(best), error)
+                break
+            parts = tuple(part for part in made if len(part) >= 4 and union_volume((part,)) > _MIN_VOLUME)
+            found = _mean_excess_m(union_volume(parts), obj)
+            if parts and found < excess:
+                best, excess = parts, found
+        parts = best
         convex.save_parts(file, parts)
     volume = union_volume(parts)
     digest = digest_json([hashlib.sha256(np.round(part, 9).tobytes()).hexdigest() for part in parts])
@@ -104,22 +119,3 @@ def _load_or_make(obj: ObjectModel, file: Path) -> ConvexPieces:
 
 def _mean_excess_m(volume: float, obj: ObjectModel) -> float:
     return (volume - obj.volume) / float(face_areas(obj.vertices, obj.faces).sum())
-
-
-def _decompose_to_limit(obj: ObjectModel) -> tuple[Floats, ...]:
-    best: tuple[Floats, ...] = (obj.hull_vertices,)
-    excess = _mean_excess_m(union_volume(best), obj)
-    for threshold in THRESHOLDS:
-        if excess <= GOOD_EXCESS_M:
-            break
-        try:
-            made = convex.coacd_parts(obj.vertices, obj.faces, {"threshold": threshold, **_COACD}, CPU_S)
-        except WorkLimitExceeded as error:
-            name = obj.name or "an object"
-            log.warning("%s: more than %d pieces need %s; the coarser ones are used", name, len(best), error)
-            break
-        parts = tuple(part for part in made if len(part) >= 4 and union_volume((part,)) > _MIN_VOLUME)
-        found = _mean_excess_m(union_volume(parts), obj)
-        if parts and found < excess:
-            best, excess = parts, found
-    return best

@@ -276,6 +276,11 @@ def _add_joint(body: Any, hand: HandModel, b: int, name: str) -> None:
     revolute = hand.joint_type[b] == JointType.REVOLUTE
     d, m, shift = int(hand.dof[b]), float(hand.multiplier[b]), float(hand.offset[b])
     ends = sorted((m * float(hand.lower[d]) + shift, m * float(hand.upper[d]) + shift))
+    found: dict[str, Any] = {}
+    if hand.drag is not None:
+        found |= {"armature": float(hand.drag.armature[b]), "frictionloss": float(hand.drag.dry_friction[b])}
+    if any(d in tendon.dofs for tendon in hand.tendons):
+        found |= {"solref_limit": COUPLING_SOLREF, "solimp_limit": COUPLING_SOLIMP}
     body.add_joint(
         name=name,
         type=mujoco.mjtJoint.mjJNT_HINGE if revolute else mujoco.mjtJoint.mjJNT_SLIDE,
@@ -283,19 +288,8 @@ def _add_joint(body: Any, hand: HandModel, b: int, name: str) -> None:
         range=ends,
         limited=mujoco.mjtLimited.mjLIMITED_TRUE,
         damping=[DAMPING_TIME * float(hand.stiffness[d]), 0, 0],
-        **_joint_properties(hand, b, d),
+        **found,
     )
-
-
-def _joint_properties(hand: HandModel, b: int, d: int) -> dict[str, Any]:
-    """Return joint properties that the protocol lacks.
-    A tendon presses a joint permanently against its limit, so the limit is as stiff as a coupling."""
-    found: dict[str, Any] = {}
-    if hand.drag is not None:
-        found |= {"armature": float(hand.drag.armature[b]), "frictionloss": float(hand.drag.dry_friction[b])}
-    if any(d in tendon.dofs for tendon in hand.tendons):
-        found |= {"solref_limit": COUPLING_SOLREF, "solimp_limit": COUPLING_SOLIMP}
-    return found
 
 
 def _add_mass_and_geoms(spec: Any, body: Any, hand: HandModel, b: int, contact: dict[str, Any], name: str) -> None:
@@ -313,16 +307,10 @@ def _add_mass_and_geoms(spec: Any, body: Any, hand: HandModel, b: int, contact: 
 
 def add_shape(spec: Any, geom: Any, piece: ConvexPiece, name: str) -> None:
     """Set a geom to the shape of a convex piece, in its body's frame."""
-    kinds = {
-        "box": mujoco.mjtGeom.mjGEOM_BOX,
-        "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-        "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-        "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    }
     if piece.kind == "hull":
         add_mesh(spec, geom, piece.vertices, name)
         return
-    geom.type = kinds[piece.kind]
+    geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{piece.kind.upper()}")
     geom.pos, geom.quat = piece.pose[:3], piece.pose[3:]
     if piece.kind == "box":
         geom.size = np.array(piece.size) / 2

@@ -29,7 +29,15 @@ def refit_hand(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
     Contacts of bodies whose new shapes touch at rest are ignored."""
     pieces = hand.pieces
     if fit == "hull":
-        pieces = _hulls_of_links(hand)
+        out: list[ConvexPiece] = []
+        ordered = sorted(hand.pieces, key=lambda piece: (piece.body, piece.link))
+        for _, group in groupby(ordered, key=lambda piece: (piece.body, piece.link)):
+            parts = list(group)
+            if len(parts) > 1:
+                vertices, faces = hull(np.concatenate([part.vertices for part in parts]))
+                parts = [ConvexPiece(parts[0].body, "hull", (), IDENTITY_POSE.copy(), vertices, faces, parts[0].link)]
+            out += parts
+        pieces = tuple(out)
     elif fit != "own":
         pieces = tuple(_fit_piece(piece, fit) for piece in pieces)
     if grown_m:
@@ -76,18 +84,6 @@ def offset_piece(piece: ConvexPiece, by_m: float) -> ConvexPiece:
 def _primitive(piece: ConvexPiece, kind: str, size: tuple[float, ...], pose: Floats) -> ConvexPiece:
     vertices, faces = tessellate(kind, size)
     return replace(piece, kind=kind, size=size, pose=pose, vertices=apply(pose, vertices), faces=faces)
-
-
-def _hulls_of_links(hand: HandModel) -> tuple[ConvexPiece, ...]:
-    out: list[ConvexPiece] = []
-    ordered = sorted(hand.pieces, key=lambda piece: (piece.body, piece.link))
-    for _, group in groupby(ordered, key=lambda piece: (piece.body, piece.link)):
-        parts = list(group)
-        if len(parts) > 1:
-            vertices, faces = hull(np.concatenate([part.vertices for part in parts]))
-            parts = [ConvexPiece(parts[0].body, "hull", (), IDENTITY_POSE.copy(), vertices, faces, parts[0].link)]
-        out += parts
-    return tuple(out)
 
 
 def _fit_piece(piece: ConvexPiece, fit: Fit) -> ConvexPiece:

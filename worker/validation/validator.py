@@ -52,7 +52,6 @@ class Verdicts:
     seconds: float
     steps: int
     rechecked: int = 0  # prefilter verdicts that the CPU rechecked; where they differ, the CPU's verdict is used
-    contradicted: int = 0
 
     @property
     def reasons(self) -> list[str]:
@@ -127,7 +126,6 @@ def validate(
         seconds=time.perf_counter() - began,
         steps=sum(t.steps for t in ordered),
         rechecked=len(first.rechecked),
-        contradicted=contradicted,
     )
 
 

@@ -1,6 +1,6 @@
 // Contact forces of a replay: arrows of force and normal at each contact of the hand, and a table of the wrenches.
-import { Group, Vector3 } from "./vendor/three.min.js";
-import { Arrow } from "./marks.js";
+import { Transform, Vec3 } from "./vendor/ogl.min.js";
+import { drawArrows } from "./marks.js";
 
 const COLOURS = { force: 0xdd7432, normal: 0x3566c8 };
 const NORMAL_M = 0.02, LONGEST_M = 0.06, LEAST_N = 0.01;
@@ -8,10 +8,9 @@ const length = (sum) => Math.hypot(...sum);
 
 export class Forces {
   /** `way` gives the largest force, which has the longest arrow. */
-  constructor(way) {
+  constructor(stage, way) {
     const sizes = way.points.flatMap((point) => (point.contacts ?? []).map((one) => length(one.slice(6, 9))));
-    this.scale = LONGEST_M / Math.max(...sizes, 1);
-    this.group = new Group();
+    Object.assign(this, { stage, group: new Transform(), scale: LONGEST_M / Math.max(...sizes, 1) });
   }
 
   show(point) {
@@ -19,12 +18,7 @@ export class Forces {
       ["normal", [x, y, z], [nx, ny, nz], NORMAL_M],
       ["force", [x, y, z], [fx, fy, fz], this.scale * length([fx, fy, fz])],
     ]).filter(([, , , size]) => size > LEAST_N * this.scale);
-    this.group.clear();
-    for (const [kind, at, along, size] of drawn) {
-      const arrow = new Arrow(COLOURS[kind]);
-      arrow.place(new Vector3(...at), new Vector3(...along).normalize(), size);
-      this.group.add(arrow.group);
-    }
+    drawArrows(this.stage, this.group, drawn.map(([kind, at, along, size]) => [COLOURS[kind], at, new Vec3(...along).normalize(), size]));
   }
 
   /** Fill the table of wrenches: forces of hand and supports, weight or push, what is left; sum of contact torques. */

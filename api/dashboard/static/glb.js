@@ -1,6 +1,4 @@
 // Reader of graspd's binary glTF (worker/stages/models.py): nodes, triangles with normals, points.
-import { BufferAttribute, BufferGeometry } from "./vendor/three.min.js";
-
 const TYPES = { 5120: Int8Array, 5121: Uint8Array, 5123: Uint16Array, 5125: Uint32Array, 5126: Float32Array };
 const WIDTHS = { SCALAR: 1, VEC3: 3 };
 const POINTS = 0;
@@ -13,27 +11,19 @@ export function readGlb(buffer) {
   const json = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 20, length)));
   const base = 20 + length + 8;
   const attribute = (index) => {
-    const accessor = json.accessors[index];
-    const span = json.bufferViews[accessor.bufferView];
-    const Type = TYPES[accessor.componentType];
-    const width = WIDTHS[accessor.type];
-    const stride = (span.byteStride ?? width * Type.BYTES_PER_ELEMENT) / Type.BYTES_PER_ELEMENT;
-    const raw = new Type(buffer, base + span.byteOffset, accessor.count * stride);
-    const packed = stride === width ? raw : raw.filter((_, i) => i % stride < width);
-    return new BufferAttribute(packed, width, accessor.normalized ?? false);
+    const { bufferView, componentType: type, type: shape, count, normalized } = json.accessors[index];
+    const { byteOffset, byteStride: stride = 0 } = json.bufferViews[bufferView];
+    const Type = TYPES[type], size = WIDTHS[shape];
+    return { data: new Type(buffer, base + byteOffset, count * (stride / Type.BYTES_PER_ELEMENT || size)), size, type, stride, count, normalized };
   };
-  const solid = (primitive) => {
-    const made = new BufferGeometry();
-    made.setAttribute("position", attribute(primitive.attributes.POSITION));
-    made.setAttribute("normal", attribute(primitive.attributes.NORMAL));
-    if (primitive.attributes.COLOR_0 !== undefined) made.setAttribute("color", attribute(primitive.attributes.COLOR_0));
-    made.setIndex(attribute(primitive.indices));
-    return made;
+  const solid = ({ attributes: { POSITION, NORMAL, COLOR_0 }, indices }) => {
+    const made = { position: attribute(POSITION), normal: attribute(NORMAL), index: attribute(indices) };
+    return COLOR_0 === undefined ? made : { ...made, color: attribute(COLOR_0) };
   };
   const nodes = json.nodes.map((node) => {
     const made = { translation: [0, 0, 0], rotation: [0, 0, 0, 1], extras: {}, children: [], ...node, solid: null, collision: null, points: null };
     for (const primitive of node.mesh === undefined ? [] : json.meshes[node.mesh].primitives) {
-      if (primitive.mode === POINTS) made.points = attribute(primitive.attributes.POSITION).array;
+      if (primitive.mode === POINTS) made.points = attribute(primitive.attributes.POSITION).data;
       else made.solid = solid(primitive);
     }
     if (made.extras.collision !== undefined) made.collision = solid(json.meshes[made.extras.collision].primitives[0]);

@@ -1,11 +1,11 @@
 // Views of grasps, one or several side by side: hand, object and scene in 3D, contacts coloured by distance, and a
 // slider along the trajectory, planned or replayed in MuJoCo. Several views turn and move together.
-import { Group, Vector3 } from "./vendor/three.min.js";
+import { Transform } from "./vendor/ogl.min.js";
 import { loadGlb } from "./glb.js";
 import { Hand, place, Thing } from "./figures.js";
 import { Contacts } from "./contacts.js";
 import { Forces } from "./forces.js";
-import { Arrow, AXES } from "./marks.js";
+import { AXES, drawArrows } from "./marks.js";
 import { freeSide, staged } from "./scenery.js";
 import { besideHand, LiveStage, startViewers } from "./stage.js";
 import { Way } from "./way.js";
@@ -35,27 +35,21 @@ class View {
     this.find = (what) => figure.querySelector(what);
     this.slider = this.find("input[type=range]");
     this.stage = new LiveStage(this.find("canvas"));
-    this.hand = new Hand(handModel);
-    this.thing = new Thing(objectModel);
-    const { all, scenery } = staged(grasp, this.hand, this.thing);
+    this.hand = new Hand(this.stage, handModel);
+    this.thing = new Thing(this.stage, objectModel);
+    const { all, scenery } = staged(this.stage, grasp, this.hand, this.thing);
     this.all = all;
     this.scenery = scenery;
-    this.stage.scene.add(all);
-    if (scenery) {
-      this.stage.scene.add(scenery.group);
-      scenery.addNeighbours(grasp.scene, () => this.stage.invalidate());
-    }
-    this.contacts = new Contacts(this.hand, this.thing);
-    this.axes = new Group();
-    AXES.forEach((color, k) => {
-      const arrow = new Arrow(color);
-      arrow.place(new Vector3(), new Vector3().setComponent(k, 1), 0.05);
-      this.axes.add(arrow.group);
-    });
-    this.thing.group.add(this.contacts.group, this.axes);
+    all.setParent(this.stage.scene);
+    scenery?.group.setParent(this.stage.scene);
+    scenery?.addNeighbours(grasp.scene);
+    this.contacts = new Contacts(this.stage, this.hand, this.thing);
+    this.axes = new Transform();
+    drawArrows(this.stage, this.axes, AXES.map((color, k) => [color, [0, 0, 0], [0, 1, 2].map((axis) => Number(axis === k)), 0.05]));
+    for (const part of [this.contacts.group, this.axes]) part.setParent(this.thing.group);
     this.planned = new Way(grasp.way, grasp.joint_names);
     this.follow(this.planned, this.planned.place("grasp"));
-    const beside = besideHand(this.hand), middle = all.localToWorld(new Vector3());
+    const beside = besideHand(this.hand), middle = all.position;
     this.stage.frame(all, grasp.scene ? freeSide(beside, grasp.scene, middle) : beside, this.planned.place("grasp") > 1 ? 1.2 : 0.7);
   }
 
@@ -88,7 +82,7 @@ class View {
     this.slider.value = String(to);
     const at = Number(this.slider.value);
     const { pose, positions, body, point } = this.way.at(at);
-    place(this.thing.group, body).updateMatrixWorld(true);
+    place(this.thing.group, body).updateMatrixWorld();
     this.hand.pose(pose, positions);
     const { touching, lowest } = this.contacts.update();
     const depth = lowest < 0 ? `deepest ${(-1000 * lowest).toFixed(2)} mm inside` : lowest < 0.005 ? `nearest ${(1000 * lowest).toFixed(2)} mm away` : "nothing within 5 mm";
@@ -112,8 +106,8 @@ class View {
       const { way, outcome } = await json(`${this.figure.dataset.grasp}/replay`);
       this.replayed = new Way(way, this.grasp.joint_names);
       this.said = outcome;
-      this.forces = new Forces(this.replayed);
-      this.all.add(this.forces.group);
+      this.forces = new Forces(this.stage, this.replayed);
+      this.all.addChild(this.forces.group);
     }
     if (this.forces) this.forces.group.visible = on;
     this.outcome = on ? this.said : null;
@@ -148,7 +142,7 @@ class View {
       axes: (on) => { this.axes.visible = on; },
       glass: (on) => this.hand.setGlass(on),
       collision: (on) => this.hand.setCollision(on),
-      wire: (on) => { this.thing.look.wireframe = on; },
+      wire: (on) => { this.thing.setWire(on); },
       scenery: (on) => { this.scenery.group.visible = on; },
     };
     const [, numbers = "", at = "", names = ""] = location.hash.match(/^#view=([-\d.,]+);([\d.]+);([a-z,]*)$/) ?? [];
@@ -170,7 +164,7 @@ class View {
     if (at) this.show(Number(at));
     this.slider.addEventListener("input", () => this.move(Number(this.slider.value)));
     this.find("[data-play]").addEventListener("click", () => this.play());
-    this.find("[data-reset]").addEventListener("click", () => this.stage.reset());
+    this.find("[data-reset]").addEventListener("click", () => { this.stage.view = this.stage.home; });
     this.find("[data-link]")?.addEventListener("click", (event) => this.link(event.target));
     this.stage.onTurn = (view) => others(this, (one) => { one.stage.view = view; });
   }

@@ -1,8 +1,9 @@
 // Page of a hand: 3D view with the findings of its check, a slider for each joint, and a form that moves the view.
-import { Box3, Quaternion, Vector3 } from "./vendor/three.min.js";
+import { Quat, Vec3 } from "./vendor/ogl.min.js";
 import { loadGlb } from "./glb.js";
-import { Hand } from "./figures.js";
+import { Hand, turnOf } from "./figures.js";
 import { Marks } from "./marks.js";
+import { boundsOf } from "./shapes.js";
 import { beforePalm, LiveStage, startViewers } from "./stage.js";
 
 const ROOT = [0, 0, 0, 1, 0, 0, 0];
@@ -15,16 +16,17 @@ class HandPage {
   constructor(figure, form, model) {
     this.figure = figure;
     this.form = form;
-    this.hand = new Hand(model);
     ({ facts: this.facts, links: this.links, drives: this.drives } = model.extras);
     this.dofs = this.facts.dofs;
     this.stage = new LiveStage(figure.querySelector("canvas"));
+    this.hand = new Hand(this.stage, model);
     this.q = this.preshape();
     this.pose(this.q);
-    this.marks = new Marks(this.hand, new Box3().setFromObject(this.hand.group).getSize(new Vector3()).toArray().reduce((a, b) => Math.max(a, b)));
-    this.stage.scene.add(this.hand.group);
+    const [low, high] = boundsOf(this.hand.group);
+    this.marks = new Marks(this.stage, this.hand, Math.max(...high.sub(low)));
+    this.hand.group.setParent(this.stage.scene);
     this.stage.frame(this.hand.group, beforePalm(this.hand), 1.0);
-    this.hand.group.add(this.marks.group);
+    this.hand.group.addChild(this.marks.group);
     this.link = this.field("palm_link").value;
     this.show();
     this.wire();
@@ -34,16 +36,12 @@ class HandPage {
     return this.form.elements[name];
   }
 
-  number(name) {
-    return Number(this.field(name).value) || 0;
-  }
-
   closing() {
     return this.dofs.map((_, i) => Number(this.field(`closing.${i}`).value));
   }
 
   preshape() {
-    return this.dofs.map((_, i) => this.number(`preshape.${i}`));
+    return this.dofs.map((_, i) => Number(this.field(`preshape.${i}`).value) || 0);
   }
 
   limits(i) {
@@ -70,24 +68,23 @@ class HandPage {
     this.pose(this.preshape());
     const { body, pose: [x, y, z, w, i, j, k] } = this.links[link];
     const group = this.hand.bodies[body].group;
-    const turn = group.getWorldQuaternion(new Quaternion());
-    const at = group.localToWorld(new Vector3(x, y, z));
-    return { at, turn: turn.multiply(new Quaternion(i, j, k, w)) };
+    const turn = turnOf(group);
+    return { at: new Vec3(x, y, z).applyMatrix4(group.worldMatrix), turn: turn.multiply(new Quat(i, j, k, w)) };
   }
 
   vector(name, scale = 1) {
-    return new Vector3(...["x", "y", "z"].map((axis) => scale * this.number(`${name}_${axis}`)));
+    return new Vec3(...["x", "y", "z"].map((axis) => scale * Number(this.field(`${name}_${axis}`).value)));
   }
 
   write(name, vector, scale, digits) {
-    ["x", "y", "z"].forEach((axis, i) => { this.field(`${name}_${axis}`).value = String(Number((scale * vector.getComponent(i)).toFixed(digits))); });
+    ["x", "y", "z"].forEach((axis, i) => { this.field(`${name}_${axis}`).value = String(Number((scale * vector[i]).toFixed(digits))); });
   }
 
   /** Palm of the form, in the root frame. */
   palm() {
     const { at, turn } = this.frameOf(this.field("palm_link").value);
     const approach = this.vector("approach").applyQuaternion(turn);
-    return { centre: this.vector("centre", 0.001).applyQuaternion(turn).add(at), approach: approach.length() > 1e-6 ? approach.normalize() : null };
+    return { centre: this.vector("centre", 0.001).applyQuaternion(turn).add(at), approach: approach.len() > 1e-6 ? approach.normalize() : null };
   }
 
   /** Position of a fingertip's pad, or else of the middle of its surface. */
@@ -95,12 +92,12 @@ class HandPage {
     const pad = this.hand.extras.pads.find((one) => this.hand.bodies[one.body].name === name);
     const flat = pad ? pad.points.flat() : points ?? [0, 0, 0];
     const mean = [0, 1, 2].map((axis) => flat.reduce((sum, value, i) => sum + (i % 3 === axis ? value : 0), 0) / (flat.length / 3));
-    return group.localToWorld(new Vector3(...mean));
+    return new Vec3(...mean).applyMatrix4(group.worldMatrix);
   }
 
   show() {
     const { centre, approach } = this.palm();
-    this.marks.approach.group.visible = approach !== null;
+    this.marks.palm.visible = approach !== null;
     if (approach) this.marks.placePalm(centre, approach);
     const chosen = new Set([...this.form.querySelectorAll("[name=fingertip]:checked")].map((box) => box.value));
     const tips = this.hand.bodies.filter((body) => chosen.has(body.name));
@@ -108,7 +105,7 @@ class HandPage {
     this.pose(closer);
     const after = tips.map((body) => this.spot(body));
     this.pose(this.q);
-    this.marks.placeClosing(tips.map((body, i) => [body.name, this.spot(body), after[i]]));
+    this.marks.placeClosing(tips.map((body, i) => [this.spot(body), after[i]]));
     this.dofs.forEach((_, i) => {
       const slider = this.form.querySelector(`[data-joint="${i}"]`);
       slider.value = String(this.q[i]);
@@ -141,7 +138,7 @@ class HandPage {
   /** Express the palm in the frame of the selected link. */
   movePalm() {
     const before = this.frameOf(this.link), link = this.field("palm_link").value, after = this.frameOf(link);
-    const back = after.turn.clone().invert();
+    const back = new Quat().inverse(after.turn);
     const centre = this.vector("centre", 0.001).applyQuaternion(before.turn).add(before.at).sub(after.at).applyQuaternion(back);
     const approach = this.vector("approach").applyQuaternion(before.turn).applyQuaternion(back);
     this.link = link;
@@ -150,14 +147,17 @@ class HandPage {
     this.show();
   }
 
+  /** Write a joint's value into the form, as its pre-shape. */
+  keep(i) {
+    this.field(`preshape.${i}`).value = String(Number(this.q[i].toFixed(6)));
+  }
+
   /** Set the pre-shape of a joint after a change of its closing direction. */
   turn(i) {
     const [low, high] = this.limits(i);
-    const share = this.dofs.length <= GRIPPER_DOFS ? 0 : PRESHAPE_SHARE;
-    const way = this.closing()[i];
-    const value = way === 0 ? Math.min(Math.max(0, low), high) : way > 0 ? low + share * (high - low) : high - share * (high - low);
-    this.field(`preshape.${i}`).value = String(Number(value.toFixed(6)));
-    this.q[i] = value;
+    const shaped = this.posture(this.dofs.length <= GRIPPER_DOFS ? 0 : PRESHAPE_SHARE)[i];
+    this.q[i] = this.closing()[i] === 0 ? Math.min(Math.max(0, low), high) : shaped;
+    this.keep(i);
     this.show();
   }
 
@@ -168,11 +168,8 @@ class HandPage {
     every("[name^='preshape.']", "input", (input) => { this.q[Number(input.name.slice(9))] = Number(input.value) || 0; this.show(); });
     every("[name=palm_link]", "change", () => this.movePalm());
     every("[name^='centre_'], [name^='approach_'], [name=fingertip]", "input", () => this.show());
-    every("[data-approach]", "click", (button) => { this.write("approach", new Vector3(...button.dataset.approach.split(",").map(Number)), 1, 0); this.show(); });
-    every("[data-take]", "click", () => {
-      this.q.forEach((value, i) => { this.field(`preshape.${i}`).value = String(Number(value.toFixed(6))); });
-      this.show();
-    });
+    every("[data-approach]", "click", (button) => { this.write("approach", new Vec3(...button.dataset.approach.split(",").map(Number)), 1, 0); this.show(); });
+    every("[data-take]", "click", () => { this.dofs.forEach((_, i) => this.keep(i)); this.show(); });
     const postures = { open: () => this.posture(0), preshape: () => this.preshape(), closed: () => this.posture(1) };
     for (const button of this.figure.querySelectorAll("[data-posture]")) {
       button.addEventListener("click", () => this.take(postures[button.dataset.posture]()));
@@ -181,7 +178,7 @@ class HandPage {
     const toggles = {
       housing: (on) => this.hand.setGlass(on, this.hand.housing),
       collision: (on) => this.hand.setCollision(on),
-      marks: (on) => this.marks.setVisible(on),
+      marks: (on) => this.marks.groups.forEach((group) => { group.visible = on; }),
     };
     for (const [name, apply] of Object.entries(toggles)) {
       const box = this.figure.querySelector(`[data-toggle=${name}]`);
@@ -190,7 +187,7 @@ class HandPage {
       box.addEventListener("change", change);
       change();
     }
-    this.figure.querySelector("[data-reset]").addEventListener("click", () => this.stage.reset());
+    this.figure.querySelector("[data-reset]").addEventListener("click", () => { this.stage.view = this.stage.home; });
     for (const hidden of document.querySelectorAll("[data-moves]")) hidden.hidden = false;
   }
 }

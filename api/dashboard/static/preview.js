@@ -1,25 +1,26 @@
-// Selected hand or object of a job's form in 3D.
+// Hand or object in 3D. In a job's form, htmx replaces the fields beside the figure, which name the model.
 import { loadGlb } from "./glb.js";
 import { figureOf } from "./figures.js";
 import { beforePalm, LiveStage } from "./stage.js";
 
 async function show(figure) {
-  const address = figure.dataset.model, said = figure.querySelector("[data-say]");
+  const address = figure.parentElement.querySelector("[data-model]").dataset.model, said = figure.querySelector("[data-say]");
   if (figure.dataset.shown === address) return;
   figure.dataset.shown = address;
   figure.dataset.state = address ? "loading" : "none";
+  said.textContent = "";
   try {
-    const made = address && figureOf(await loadGlb(address));
-    if (figure.dataset.model !== address) return;
+    const model = address && await loadGlb(address);
+    if (figure.dataset.shown !== address) return;
     const stage = figure.stage ??= new LiveStage(figure.querySelector("canvas"));
     // An old model must not look like the selected one.
-    stage.shown?.removeFromParent();
+    stage.shown?.setParent(null);
     stage.invalidate();
-    if (!made) return;
+    if (!model) return;
+    const made = figureOf(stage, model);
     stage.shown = made.group;
-    stage.scene.add(made.group);
+    made.group.setParent(stage.scene);
     stage.frame(made.group, beforePalm(made), 1.0);
-    said.textContent = "";
     figure.dataset.state = "ready";
   } catch (error) {
     figure.dataset.state = "failed";
@@ -29,5 +30,5 @@ async function show(figure) {
 
 for (const figure of document.querySelectorAll("[data-viewer=model]")) {
   show(figure);
-  new MutationObserver(() => show(figure)).observe(figure, { attributes: true, attributeFilter: ["data-model"] });
+  new MutationObserver(() => show(figure)).observe(figure.parentElement, { childList: true, subtree: true, attributeFilter: ["data-model"] });
 }

@@ -1,5 +1,4 @@
 // Pictures of grasps, hands and objects in lists: one small stage draws each picture when it scrolls into view.
-import { Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { between, figureOf, Hand, Thing } from "./figures.js";
 import { freeSide, staged } from "./scenery.js";
@@ -7,32 +6,32 @@ import { beforePalm, besideHand, Stage } from "./stage.js";
 
 const SIDE = 220;
 let stage = null;
+const ready = () => (stage ??= new Stage());
 const figures = new Map();
 let queue = Promise.resolve();
 
 function keep(address, Kind) {
-  if (!figures.has(address)) figures.set(address, loadGlb(address).then((model) => new Kind(model)));
+  if (!figures.has(address)) figures.set(address, loadGlb(address).then((model) => new Kind(ready(), model)));
   return figures.get(address);
 }
 
 /** Draw a stage with all its figures, and copy the picture. */
 function picture(canvas, shown, side, room) {
-  stage ??= new Stage();
-  stage.scene.add(...shown);
+  for (const group of shown) group.setParent(stage.scene);
   stage.size(SIDE, SIDE * 0.8, Math.min(devicePixelRatio, 2));
   stage.frame(shown[0], side, room);
   stage.draw();
-  canvas.width = stage.renderer.domElement.width;
-  canvas.height = stage.renderer.domElement.height;
-  canvas.getContext("2d").drawImage(stage.renderer.domElement, 0, 0);
-  stage.scene.remove(...shown);
+  canvas.width = stage.gl.canvas.width;
+  canvas.height = stage.gl.canvas.height;
+  canvas.getContext("2d").drawImage(stage.gl.canvas, 0, 0);
+  for (const group of shown) group.setParent(null);
   canvas.dataset.state = "ready";
 }
 
 async function draw(canvas) {
   if (canvas.dataset.model) {
-    const made = figureOf(await loadGlb(canvas.dataset.model));
-    return picture(canvas, [made.group], beforePalm(made), 0.9);
+    const made = figureOf(ready(), await loadGlb(canvas.dataset.model));
+    return picture(canvas, [made.group], beforePalm(made));
   }
   const [grasp, hand, thing] = await Promise.all([
     fetch(canvas.dataset.grasp).then((answer) => (answer.ok ? answer.json() : Promise.reject(new Error(answer.status)))),
@@ -42,9 +41,9 @@ async function draw(canvas) {
   const { pose, positions } = between(grasp.postures.grasp, grasp.postures.grasp, 0, grasp.joint_names);
   hand.pose(pose, positions);
   thing.group.position.set(0, 0, 0);
-  const { all, scenery } = staged(grasp, hand, thing);
+  const { all, scenery } = staged(stage, grasp, hand, thing);
   const beside = besideHand(hand);
-  const side = grasp.scene ? freeSide(beside, grasp.scene, all.localToWorld(new Vector3())) : beside;
+  const side = grasp.scene ? freeSide(beside, grasp.scene, all.position) : beside;
   picture(canvas, scenery ? [all, scenery.group] : [all], side, 0.74);
 }
 

@@ -24,27 +24,10 @@ from graspd.service.index.tables import (
     tasks,
     workers,
 )
+from graspd.service.model import planning, records
 from graspd.service.model.domain import Asset, JobOptions
 from graspd.service.model.errors import LoadError, SceneError
 from graspd.service.model.messages import WorkerHeartbeat
-from graspd.service.model.planning import (
-    TaskFacts,
-    count_ranges,
-    job_state,
-    plan_tasks,
-    range_ready_mask,
-    range_states,
-    stages_of,
-)
-from graspd.service.model.records import (
-    AttemptRecord,
-    DatasetEvent,
-    DatasetRecord,
-    JobEvent,
-    JobRecord,
-    ObjectSet,
-    Snapshot,
-)
 from graspd.service.model.states import State
 from graspd.service.store.manifests import ShardManifest
 
@@ -55,7 +38,7 @@ _MOST_REPAIRS: Final = 100
 _LONGEST_TEXT: Final = 2000
 
 
-def job_row(record: JobRecord) -> Row:
+def job_row(record: records.JobRecord) -> Row:
     others = {
         "state": State.QUEUED.value,
         "priority": record.priority.value,
@@ -89,9 +72,9 @@ _UNSTARTED: Final = {
 }
 
 
-def task_rows(record: JobRecord, ranges: range | None = None) -> Iterator[Row]:
-    order = stages_of(record.request)
-    for task in plan_tasks(record, ranges):
+def task_rows(record: records.JobRecord, ranges: range | None = None) -> Iterator[Row]:
+    order = planning.stages_of(record.request)
+    for task in planning.plan_tasks(record, ranges):
         yield {
             "id": task.id,
             "job_id": record.id,
@@ -230,11 +213,14 @@ def _first_batch_failed_condition() -> ColumnElement[bool]:
 
 def _changed_tasks(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, bool]]:
     """Return the changed tasks of a batch, each with its new state and readiness."""
-    facts = [TaskFacts(running=row["state"] == State.RUNNING, **{name: row[name] for name in _FACTS}) for row in chain]
-    states = range_states(facts, job_cancelled=cancelled)
+    facts = [
+        planning.TaskFacts(running=row["state"] == State.RUNNING, **{name: row[name] for name in _FACTS})
+        for row in chain
+    ]
+    states = planning.range_states(facts, job_cancelled=cancelled)
     return [
         (row["id"], state.value, ready)
-        for row, state, ready in zip(chain, states, range_ready_mask(states), strict=True)
+        for row, state, ready in zip(chain, states, planning.range_ready_mask(states), strict=True)
         if (row["state"], row["ready"]) != (state.value, ready)
     ]
 
@@ -252,7 +238,7 @@ def _derive_job_states(connection: Connection, ids: Sequence[str]) -> dict[str, 
         row = known.get(job)
         found = [state for state in State if row is not None and row[state.value]]
         found += [State.QUEUED] if row is not None and row["entering"] else []
-        state = states[job] = job_state(found)
+        state = states[job] = planning.job_state(found)
         if row is None:
             continue
         values: dict[str, Any] = {"state": state.value, "finished": None, "reason": None}
@@ -278,14 +264,14 @@ RANGES_AT_ONCE: Final = 500
 class Changes(IndexPart):
     """Writes of jobs, shards, attempts and assets. `within` makes a write part of a larger transaction."""
 
-    def add_job(self, record: JobRecord, *, within: Connection | None = None) -> State:
+    def add_job(self, record: records.JobRecord, *, within: Connection | None = None) -> State:
         """Add a job with all its tasks; tasks whose shard exists count as succeeded."""
         with self.database.write_transaction(within) as connection:
             self._upsert_job(connection, record)
             self._upsert_tasks(connection, list(task_rows(record)))
             return derive_states(connection, record.id)
 
-    def enter_job(self, record: JobRecord, *, within: Connection) -> None:
+    def enter_job(self, record: records.JobRecord, *, within: Connection) -> None:
         """Add a job with its first `RANGES_AT_ONCE` ranges of tasks; `enter_next_tasks` adds the other ones."""
         is_new = within.scalar(select(jobs.c.id).where(jobs.c.id == record.id)) is None
         self._upsert_job(within, record)
@@ -296,7 +282,7 @@ class Changes(IndexPart):
         query = select(notes.c.name).where(notes.c.name.startswith(ENTERING)).order_by(notes.c.name)
         return [name.removeprefix(ENTERING) for name in self.database.column(query)]
 
-    def enter_next_tasks(self, job_id: str, record: JobRecord | None) -> None:
+    def enter_next_tasks(self, job_id: str, record: records.JobRecord | None) -> None:
         """Add the next tasks of a large job; without a record (None), for example after a deletion, stop."""
         with self.database.write_transaction() as connection:
             exists_now = connection.scalar(select(jobs.c.id).where(jobs.c.id == job_id)) is not None
@@ -325,7 +311,7 @@ class Changes(IndexPart):
             return derive_task_and_job_states(connection, touched)
 
     def add_attempt(
-        self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
+        self, attempt: records.AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
     ) -> State | None:
         """Add a failed attempt; the next is due at `not_before` [s]. Return the job's state, if changed."""
         with self.database.write_transaction(within) as connection:
@@ -345,7 +331,9 @@ class Changes(IndexPart):
             touched = connection.execute(changed.returning(tasks.c.job_id, tasks.c.batch)).first()
             return None if touched is None else derive_states(connection, touched.job_id, [touched.batch])
 
-    def set_job_events(self, job_id: str, events: Sequence[JobEvent], *, within: Connection | None = None) -> State:
+    def set_job_events(
+        self, job_id: str, events: Sequence[records.JobEvent], *, within: Connection | None = None
+    ) -> State:
         """Apply the complete list of a job's events, oldest first, to the job and its tasks."""
         cancelled = bool(events) and events[-1].what == "cancelled"
         with self.database.write_transaction(within) as connection:
@@ -363,7 +351,7 @@ class Changes(IndexPart):
         with self.database.write_transaction(within) as connection:
             upsert(connection, assets, [asset_row(asset, check)], keep=("last_attempt", "queued", "not_before"))
 
-    def _upsert_job(self, connection: Connection, record: JobRecord) -> None:
+    def _upsert_job(self, connection: Connection, record: records.JobRecord) -> None:
         upsert(connection, jobs, [job_row(record)], keep=("state", "cancelled", "finished", "reason"))
 
     def _upsert_tasks(self, connection: Connection, rows: list[Row]) -> None:
@@ -373,9 +361,9 @@ class Changes(IndexPart):
             row.update(known.get(row["shard_id"], {}))
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "priority"])
 
-    def _enter_ranges(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
+    def _enter_ranges(self, connection: Connection, record: records.JobRecord, first: int, *, goes_on: bool) -> None:
         """Add up to `RANGES_AT_ONCE` ranges from `first`; with `goes_on`, note the next range, if any."""
-        number = count_ranges(record.request.grasps, record.span)
+        number = planning.count_ranges(record.request.grasps, record.span)
         some = range(first, min(number, first + RANGES_AT_ONCE))
         self._upsert_tasks(connection, list(task_rows(record, some)))
         if goes_on and some.stop < number:
@@ -406,7 +394,7 @@ def _finished_task_columns(worker: Any, device: Any, seconds: Any, created: Any)
 class DatasetChanges(IndexPart):
     """Writes of datasets. `within` makes a write part of a larger transaction."""
 
-    def add(self, record: DatasetRecord, *, within: Connection | None = None) -> None:
+    def add(self, record: records.DatasetRecord, *, within: Connection | None = None) -> None:
         row = {
             **{name: getattr(record, name) for name in ("name", "digest", "revisions", "created", "owner", "project")},
             "hands": [member.model_dump() for member in record.hands],
@@ -438,7 +426,9 @@ class DatasetChanges(IndexPart):
             upsert(connection, datasets, [row], keep=("cancelled", "events", "applied", "planned"))
             upsert(connection, dataset_cells, cells)
 
-    def set_events(self, name: str, events: Sequence[DatasetEvent], *, within: Connection | None = None) -> None:
+    def set_events(
+        self, name: str, events: Sequence[records.DatasetEvent], *, within: Connection | None = None
+    ) -> None:
         """Apply the complete list of a dataset's events, oldest first."""
         cancelled = bool(events) and events[-1].what == "cancelled"
         number = max((event.number for event in events), default=0)
@@ -446,12 +436,12 @@ class DatasetChanges(IndexPart):
         with self.database.write_transaction(within) as connection:
             connection.execute(update(datasets).where(datasets.c.name == name).values(**values))
 
-    def add_snapshot(self, snapshot: Snapshot, *, within: Connection | None = None) -> None:
+    def add_snapshot(self, snapshot: records.Snapshot, *, within: Connection | None = None) -> None:
         row = row_from(dataset_snapshots, snapshot, shards=len(snapshot.shards))
         with self.database.write_transaction(within) as connection:
             upsert(connection, dataset_snapshots, [row])
 
-    def add_object_set(self, found: ObjectSet, *, within: Connection | None = None) -> None:
+    def add_object_set(self, found: records.ObjectSet, *, within: Connection | None = None) -> None:
         row = row_from(object_sets, found, objects=list(found.objects))
         with self.database.write_transaction(within) as connection:
             upsert(connection, object_sets, [row])

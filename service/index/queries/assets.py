@@ -1,6 +1,7 @@
 """Queries of hands and objects, and of named sets of objects."""
 
 from collections.abc import Collection
+from typing import Unpack
 
 from sqlalchemy import ColumnElement, Connection, and_, case, or_, select
 
@@ -17,10 +18,9 @@ class Assets(database.IndexPart):
         self,
         kind: AssetKind,
         *,
-        limit: int = 50,
-        cursor: str | None = None,
         refused: bool = False,
         scope: ProjectScope = EVERYTHING,
+        **part: Unpack[database.Paging],
     ) -> Page[AssetView]:
         """Return a page of hands or objects in all versions, newest first; `refused` includes refused ones."""
         query = select(assets).where(assets.c.kind == kind.value, *database.asset_scope_conditions(scope))
@@ -28,7 +28,7 @@ class Assets(database.IndexPart):
             query = query.where(_not_refused())
         with self.database.read_transaction() as connection:
             key = assets.c.created, assets.c.digest
-            rows, following = database.page_rows(connection, query, *key, limit=limit, cursor=cursor)
+            rows, following = database.page_rows(connection, query, *key, **part)
         return Page(items=[AssetView(**row) for row in rows], next=following)
 
     def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:

@@ -2,11 +2,11 @@
 
 from collections import defaultdict
 from collections.abc import Collection, Sequence
-from typing import Any, Final
+from typing import Any, Final, Unpack
 
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select
 
-from graspd.service.index.database import IndexPart, page_rows, scope_conditions
+from graspd.service.index.database import IndexPart, Paging, page_rows, scope_conditions
 from graspd.service.index.queries.jobs import SHARE_DONE, outcomes_of
 from graspd.service.index.tables import attempts, dataset_cells, dataset_snapshots, datasets, jobs, shards, tasks
 from graspd.service.index.views import CellView, DatasetView, Page, SnapshotView
@@ -21,12 +21,10 @@ _IS_BASE: Final = shards.c.stage == Stage.SYNTHESIZE.value
 
 
 class Datasets(IndexPart):
-    def page(
-        self, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
-    ) -> Page[DatasetView]:
+    def page(self, *, scope: ProjectScope = EVERYTHING, **part: Unpack[Paging]) -> Page[DatasetView]:
         query, key = select(datasets).where(*scope_conditions(scope, datasets)), (datasets.c.created, datasets.c.name)
         with self.database.read_transaction() as connection:
-            rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
+            rows, following = page_rows(connection, query, *key, **part)
             return Page(items=[_dataset_view(connection, row) for row in rows], next=following)
 
     def get(self, name: str, *, scope: ProjectScope = EVERYTHING) -> DatasetView:
@@ -59,13 +57,7 @@ class Datasets(IndexPart):
         return {row["name"]: row["events"] for row in rows if _has_ended(within, row)}
 
     def cells(
-        self,
-        name: str,
-        *,
-        state: State | None = None,
-        limit: int = 50,
-        cursor: str | None = None,
-        scope: ProjectScope = EVERYTHING,
+        self, name: str, *, state: State | None = None, scope: ProjectScope = EVERYTHING, **part: Unpack[Paging]
     ) -> Page[CellView]:
         with self.database.read_transaction() as connection:
             dataset = _dataset_row(connection, name, scope)
@@ -76,7 +68,7 @@ class Datasets(IndexPart):
             if state is not None:
                 query = query.where(now == state.value)
             key = dataset_cells.c.position
-            rows, following = page_rows(connection, query, key, limit=limit, cursor=cursor, descending=False)
+            rows, following = page_rows(connection, query, key, descending=False, **part)
             views = _cell_views(connection, rows, JobOptions.model_validate(dataset["options"]))
         return Page(items=views, next=following)
 
@@ -90,14 +82,12 @@ class Datasets(IndexPart):
             _dataset_row(connection, name)
             return [SnapshotShard(**row) for row in connection.execute(query).mappings()]
 
-    def snapshots(
-        self, name: str, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
-    ) -> Page[SnapshotView]:
+    def snapshots(self, name: str, *, scope: ProjectScope = EVERYTHING, **part: Unpack[Paging]) -> Page[SnapshotView]:
         query = select(dataset_snapshots).where(dataset_snapshots.c.dataset == name)
         key = (dataset_snapshots.c.created, dataset_snapshots.c.digest)
         with self.database.read_transaction() as connection:
             _dataset_row(connection, name, scope)
-            rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
+            rows, following = page_rows(connection, query, *key, **part)
         return Page(items=[SnapshotView(**row) for row in rows], next=following)
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Unpack
 
 from pydantic import Field
 from sqlalchemy import ColumnElement, Connection, Float, Select, String, Subquery, and_, func, not_, or_, select, tuple_
@@ -48,14 +48,9 @@ _BEST_FIRST = GraspSort()
 
 class Grasps(database.IndexPart):
     def page(
-        self,
-        where: GraspFilter | None = None,
-        *,
-        sort: GraspSort = _BEST_FIRST,
-        limit: int = 50,
-        cursor: str | None = None,
+        self, where: GraspFilter | None = None, *, sort: GraspSort = _BEST_FIRST, **part: Unpack[database.Paging]
     ) -> Page[GraspView]:
-        size = database.page_size(limit)
+        size, cursor = database.page_size(part.get("limit", 50)), part.get("cursor")
         start = None if cursor is None else database.decode_cursor(cursor, (float, int, str, type(None)), str, int)
         with self.database.read_transaction() as connection:
             rows = search(connection, where, sort, size + 1, start)
@@ -87,6 +82,8 @@ class Grasps(database.IndexPart):
 
 #: Maximum number of rows to fetch by an index and sort, which is faster than a scan of a million rows.
 SORTED_AT_ONCE: Final = 40_000
+#: Groups of conditions on the tasks that made the grasps.
+_OF_TASKS: Final = ("job", "dataset", "project")
 #: Numbers of rows to read in the wanted order: few at first, because these suffice for most filters.
 LOOKED_AT: Final = (1000, 20_000)
 #: Columns by name, of the table of grasps or of a subquery.
@@ -163,19 +160,14 @@ def conditions(where: GraspFilter | None) -> list[Test]:
     """Return the tests of a filter, all of which must hold; InputError for an invalid expression."""
     where = where or GraspFilter()
     found: list[Test] = []
-    if where.job is not None:
-        of_job = (tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value)
-        found.append(ColumnCondition("job", grasps.c.shard_id, in_op, select(tasks.c.shard_id).where(*of_job)))
-    if where.dataset is not None:
-        made = _tasks_of_dataset(where.dataset).with_only_columns(tasks.c.shard_id)
-        found.append(ColumnCondition("dataset", grasps.c.shard_id, in_op, made))
+    for group in _OF_TASKS:
+        if getattr(where, group) is not None:
+            made = _tasks_of(group, where).with_only_columns(tasks.c.shard_id)
+            found.append(ColumnCondition(group, grasps.c.shard_id, in_op, made))
     if where.tag is not None:
         found.append(TagCondition(where.tag))
     if where.where is not None:
         found.append(ExpressionCondition(parse_where(where.where)))
-    if where.project is not None:
-        made = _tasks_of_project(where.project).with_only_columns(tasks.c.shard_id)
-        found.append(ColumnCondition("project", grasps.c.shard_id, in_op, made))
     for name, wanted in (("hand", where.hand), ("object", where.object)):
         if wanted is not None:
             found.append(ColumnCondition("pair", grasps.c[name], operator.eq, wanted))
@@ -268,13 +260,8 @@ def _selective_group(connection: Connection, where: GraspFilter | None, wanted: 
 def estimate_row_count(connection: Connection, where: GraspFilter, group: str, wanted: Sequence[Test] = ()) -> int:
     """Estimate the rows that match a group of conditions; for metrics, count at most `SORTED_AT_ONCE` + 1."""
     query: Select[Any]
-    if group == "job":
-        of_job = (tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value)
-        query = select(func.sum(tasks.c.count)).where(*of_job)
-    elif group == "project":
-        query = _tasks_of_project(where.project or "").with_only_columns(func.sum(tasks.c.count))
-    elif group == "dataset":
-        query = _tasks_of_dataset(where.dataset or "").with_only_columns(func.sum(tasks.c.count))
+    if group in _OF_TASKS:
+        query = _tasks_of(group, where).with_only_columns(func.sum(tasks.c.count))
     elif group == "tag":
         query = select(func.count()).where(tagged.c.tag == where.tag)
     elif group == "pair":
@@ -287,14 +274,15 @@ def estimate_row_count(connection: Connection, where: GraspFilter, group: str, w
     return int(connection.scalar(query) or 0)
 
 
-def _tasks_of_project(project: str) -> Select[Any]:
-    joined = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id)
-    return joined.where(jobs.c.project == project, tasks.c.stage == Stage.SYNTHESIZE.value)
-
-
-def _tasks_of_dataset(dataset: str) -> Select[Any]:
-    joined = select(tasks.c.id).join(dataset_cells, dataset_cells.c.job_id == tasks.c.job_id)
-    return joined.where(dataset_cells.c.dataset == dataset, tasks.c.stage == Stage.SYNTHESIZE.value)
+def _tasks_of(group: str, where: GraspFilter) -> Select[Any]:
+    """Return the tasks that make the grasps of a job, a dataset or a project."""
+    made = select(tasks.c.id).where(tasks.c.stage == Stage.SYNTHESIZE.value)
+    if group == "job":
+        return made.where(tasks.c.job_id == where.job)
+    if group == "project":
+        return made.join(jobs, jobs.c.id == tasks.c.job_id).where(jobs.c.project == where.project)
+    joined = made.join(dataset_cells, dataset_cells.c.job_id == tasks.c.job_id)
+    return joined.where(dataset_cells.c.dataset == where.dataset)
 
 
 def _count_rows(connection: Connection, rows: Subquery) -> int:

@@ -4,7 +4,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Unpack
 
 from sqlalchemy import Column, ColumnElement, Connection, Float, and_, case, cast, func, literal_column, select
 
@@ -45,9 +45,8 @@ class Jobs(database.IndexPart):
         words: Mapping[str, Collection[str]] = MappingProxyType({}),
         sort: JobSort = "created",
         descending: bool = True,
-        limit: int = 50,
-        cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
+        **part: Unpack[database.Paging],
     ) -> Page[JobView]:
         """Return a page of jobs, by default the newest first; `prefix` is the beginning of their ids.
 
@@ -57,7 +56,7 @@ class Jobs(database.IndexPart):
         query = select(jobs).where(*database.scope_conditions(scope, jobs), *same)
         query = query.where(jobs.c.id.startswith(prefix, autoescape=True)) if prefix else query
         query = query.where(*(_contains_word(word, owners) for word, owners in words.items()))
-        page = partial(database.page_rows, limit=limit, cursor=cursor, descending=descending)
+        page = partial(database.page_rows, descending=descending, **part)
         with self.database.read_transaction() as connection:
             key: ColumnElement[Any] = jobs.c[sort] if sort != "duration" else _duration(connection)
             rows, following = page(connection, query.add_columns(key) if sort == "duration" else query, key, jobs.c.id)
@@ -90,7 +89,7 @@ class Jobs(database.IndexPart):
         query = select(tasks).where(tasks.c.job_id == job, *_equality_conditions({tasks.c.state: state}))
         key = (tasks.c.job_id, tasks.c.batch, tasks.c.position)
         with self.database.read_transaction() as connection:
-            rows, following = database.page_rows(connection, query, *key, limit=limit, cursor=None, descending=False)
+            rows, following = database.page_rows(connection, query, *key, limit=limit, descending=False)
         return Page(items=[_task_view(row) for row in rows], next=following)
 
     def task(self, task_id: str, *, scope: ProjectScope = EVERYTHING) -> TaskView:
@@ -207,9 +206,8 @@ class Shards(database.IndexPart):
         *,
         job: str | None = None,
         kind: ShardKind | None = None,
-        limit: int = 50,
-        cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
+        **part: Unpack[database.Paging],
     ) -> Page[ShardView]:
         """Return a page of shards, newest first, without their manifests."""
         query = select(shards).where(*database.shard_scope_conditions(scope, shards.c.id))
@@ -218,7 +216,7 @@ class Shards(database.IndexPart):
             query = query.where(shards.c.id.in_(select(tasks.c.shard_id).where(tasks.c.job_id == job)))
         with self.database.read_transaction() as connection:
             key = shards.c.created, shards.c.id
-            rows, following = database.page_rows(connection, query, *key, limit=limit, cursor=cursor)
+            rows, following = database.page_rows(connection, query, *key, **part)
         return Page(items=[ShardView.model_validate({**row, "manifest": {}}) for row in rows], next=following)
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:

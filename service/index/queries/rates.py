@@ -116,7 +116,9 @@ class Rates:
         for key, words in levels:
             if key in self._groups:
                 return self._measured_rate(key, words)
-        return self._stored_rate()
+        seconds, share, origin = _stored_rates(self._options)
+        origin, factor = self.machine.scaled_origin(origin), self.machine.factor
+        return Rate(seconds * factor, share, _BYTES_PER_GRASP, origin, 0, self.machine.stored_spread)
 
     def _measured_rate(self, key: Hashable, words: str) -> Rate:
         if key not in self._known:
@@ -132,11 +134,6 @@ class Rates:
                 spread=_relative_deciles([batch.seconds / batch.candidates for batch in batches], MEASURED_SPREAD),
             )
         return self._known[key]
-
-    def _stored_rate(self) -> Rate:
-        seconds, share, origin = _stored_rates(self._options)
-        origin, factor = self.machine.scaled_origin(origin), self.machine.factor
-        return Rate(seconds * factor, share, _BYTES_PER_GRASP, origin, 0, self.machine.stored_spread)
 
 
 def expected_candidates(rate: Rate, options: JobOptions) -> float:

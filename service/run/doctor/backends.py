@@ -13,7 +13,7 @@ from redis import Redis
 from redis.exceptions import RedisError
 from sqlalchemy import func, make_url, select
 
-from graspd.service.index.condition import IndexCondition, read_condition
+from graspd.service.index.database import IndexCondition, read_condition
 from graspd.service.index.index import Index
 from graspd.service.index.rebuild import differences, missing_names
 from graspd.service.index.tables import shards

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 from typing import Final
 
 from graspd.service.model.errors import GraspdError
@@ -66,17 +67,7 @@ def _finding_of(check: Check) -> Finding:
         return bad(f"the check itself failed: {line}", "report it to the authors of graspd")
 
 
-def good(message: str) -> Finding:
-    return Finding(Condition.GOOD, message)
-
-
-def warning(message: str, fix: str) -> Finding:
-    return Finding(Condition.WARNING, message, fix)
-
-
-def bad(message: str, fix: str) -> Finding:
-    return Finding(Condition.BAD, message, fix)
-
-
-def skipped(why: str) -> Finding:
-    return Finding(Condition.SKIPPED, why)
+good = partial(Finding, Condition.GOOD)
+warning = partial(Finding, Condition.WARNING)
+bad = partial(Finding, Condition.BAD)
+skipped = partial(Finding, Condition.SKIPPED)

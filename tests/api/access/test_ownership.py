@@ -1,7 +1,7 @@
 """Rights of keys: who may cancel, retry and delete what, and what the keys of a project may use together."""
 
 from collections.abc import Callable, Iterator
-from contextlib import closing, nullcontext
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -12,10 +12,8 @@ from starlette.testclient import TestClient
 from graspd.api.access.auth import ForeignResource, caller, require_ownership
 from graspd.api.access.keys import Key, KeyFile, ProjectLimits, Scope
 from graspd.api.app import create_app
-from graspd.service.index.index import Index
-from graspd.service.index.rebuild import rebuild
 from graspd.service.index.tables import shards
-from graspd.service.model.states import AssetKind, State
+from graspd.service.model.states import State
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.network_file import to_bytes
@@ -111,18 +109,6 @@ def test_keys_of_before_there_were_ids_have_one_through_rotation(keys: KeyFile) 
     old = {"name": "ann", "scope": "submit", "sha256": "a" * 64, "created": "2026-01-01T00:00:00Z"}
     key, again = Key.model_validate(old), Key.model_validate(old | {"sha256": "b" * 64, "created": "2026-02-01"})
     assert key.id and key.id == again.id and key.id != Key.model_validate(old | {"name": "bob"}).id
-
-
-def test_owners_are_in_the_store_and_survive_a_lost_index(ask: Ask, services: Services, keys: KeyFile) -> None:
-    ann = next(key.id for key in keys.list() if key.name == "ann")
-    job = submitted(ask, "ann")
-    ask("ann", "POST", "/v1/datasets", json=MATRIX)
-    file = ("ball.stl", b"solid ball\nendsolid ball\n")
-    assert ask("ann", "POST", "/v1/objects", files={"file": file}).status_code == 202
-    with closing(Index("sqlite://")) as fresh:
-        rebuild(fresh, services.store)
-        found = fresh.jobs.get(job), fresh.datasets.get("d"), fresh.assets.get(AssetKind.OBJECT, "ball")
-        assert [one.owner for one in found] == [ann, ann, ann]
 
 
 @pytest.mark.parametrize(("scope", "passes"), [(Scope.READ, False), (Scope.SUBMIT, False), (Scope.ADMIN, True)])

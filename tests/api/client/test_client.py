@@ -92,7 +92,7 @@ def test_a_check_that_no_worker_makes_is_waited_for_so_long() -> None:
 
 def test_no_job_is_made_of_a_refused_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     refusal = httpx.Response(200, json=ASSET | {"verdict": "refuse", "message": "the mesh is open"})
-    monkeypatch.setattr("graspd.client.commands.open_client", lambda _: client_of(lambda _: refusal))
+    monkeypatch.setattr("graspd.client.reports.open_client", lambda _: client_of(lambda _: refusal))
     (tmp_path / "open.stl").touch()
     assert "refused: the mesh is open" in refused("submit --hand allegro --object", tmp_path / "open.stl")
 

@@ -64,7 +64,7 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
     def opened(_: str | None) -> Iterator[Service]:
         yield Service()
 
-    for module in ("commands", "reports", "tag_commands", "access_commands"):
+    for module in ("reports", "tag_commands", "access_commands"):
         monkeypatch.setattr(f"graspd.client.{module}.open_client", opened)
 
     def run(*arguments: str) -> list[str]:

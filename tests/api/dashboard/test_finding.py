@@ -18,7 +18,7 @@ from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.queue.port import rq_id
 from graspd.service.settings import Settings
-from tests.api.factories import add_job, fail, finish, finish_all, people_of
+from tests.api.factories import add_job, finish, finish_all, people_of
 from tests.fakes import fail_task, plan_all
 
 NEVER = "9999-01-01T00:00:00Z"
@@ -166,6 +166,8 @@ def test_hands_and_objects_name_their_datasets_and_licence(http: TestClient, ser
         assert page.count("data-model=") == page.count("Apache-2.0") == 3
         assert page.count('href="/datasets/kitchen"') == 1 == 3 - others
     assert "<dt>Joints</dt><dd>16</dd>" in http.get("/hands").text
+    for words in ("<dt>Size</dt><dd>60 × 45 × 90 mm</dd>", "<dt>Mass</dt><dd>0.156 kg</dd>"):
+        assert words in http.get("/objects/block").text and words in http.get("/objects").text, "without a check"
     assert 'href="/datasets/kitchen"' in http.get("/objects/mug").text
     assert 'href="/datasets/kitchen"' not in http.get("/objects/block").text
     assert 'href="/datasets/kitchen"' in http.get("/hands/allegro").text
@@ -185,8 +187,3 @@ def test_the_search_finds_everything_and_leads_there(http: TestClient, services:
         answer = http.get(f"/search?q={text}&go=true", follow_redirects=False)
         assert answer.headers["location"] == address
     assert "Nothing has this name" in http.get("/search?q=zzz&go=true").text
-
-
-def test_a_failed_job_has_its_reason_in_the_list(http: TestClient, services: Services) -> None:
-    fail(services, add_job(services), "the mesh has 12 open edges")
-    assert "the mesh has 12 open edges" in http.get("/jobs?state=failed").text

@@ -80,6 +80,7 @@ def test_a_failed_job_says_why_and_offers_a_retry(http: TestClient, services: Se
     fail(services, record := add_job(services), "<b>not</b> watertight")
     page = http.get(f"/jobs/{record.id}").text
     assert "&lt;b&gt;not&lt;/b&gt; watertight" in page and f'action="/jobs/{record.id}/retry"' in page
+    assert "&lt;b&gt;not&lt;/b&gt; watertight" in http.get("/jobs?state=failed").text
 
 
 def test_a_thumbnail_is_the_picture_of_the_shard(http: TestClient, services: Services) -> None:
@@ -216,7 +217,7 @@ def calls(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], 
         return httpx.Response(found.status_code, content=found.content)
 
     client = Client(BASE_URL, transport=httpx.MockTransport(answer))
-    for module in ("graspd.remote", "graspd.client.commands"):
+    for module in ("graspd.remote", "graspd.client.reports"):
         monkeypatch.setattr(f"{module}.open_client", lambda url, key=None: client)
     monkeypatch.setattr(client, "close", lambda: None)
 

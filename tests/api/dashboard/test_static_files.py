@@ -17,8 +17,8 @@ ENVIRONMENT: Final = environment()
 TEMPLATES: Final = sorted(ENVIRONMENT.list_templates())
 FOLDERS = (STATIC / "vendor", Path(__file__).parents[2] / "browser" / "vendor")
 #: What is bundled comes with the list of its parts.
-SOURCES = {"three-entry.mjs"}
-PERMISSIVE = {"MIT", "0BSD", "OFL-1.1", "Apache-2.0"}
+SOURCES = {"ogl-entry.mjs"}
+PERMISSIVE = {"MIT", "0BSD", "OFL-1.1", "Apache-2.0", "Unlicense"}
 #: What WCAG asks for between a text of that size and what it stands on.
 CONTRAST = 4.5
 _PAIR = r"light-dark\((#\w{6}), (#\w{6})\)"

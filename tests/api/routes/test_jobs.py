@@ -152,16 +152,6 @@ def test_neighbours_are_named_and_come_back_with_their_digests(http: TestClient)
     assert "there is no object 'teapot'" in unknown.json()["detail"]
 
 
-def test_grasps_are_filtered_by_the_kind_of_their_scene(http: TestClient, services: Services) -> None:
-    for fields in ({}, {"scene": "table", "scenes": 2}):
-        finish_all(services, add_job(services, **fields))
-    for kind, counts in (("free", {"free"}), ("table", {"table"}), ("any", {"table"}), ("bin", set())):
-        found = http.get("/v1/grasps", params={"scene": kind, "limit": 100}).json()["items"]
-        assert {grasp["scene_kind"] for grasp in found} == counts
-    assert http.get("/v1/grasps", params={"scene": "moon"}).status_code == 422
-    assert http.get("/v1/grasps", params={"min_clearance_m": 0.001, "lift_hard": "true"}).json()["items"] == []
-
-
 def test_the_form_asks_for_a_scene_and_neighbours(http: TestClient) -> None:
     form = {"hand": "allegro", "object": "mug", "grasps": "32", "fidelity": "draft", "scene": "bin", "faces": "all"}
     answer = http.post("/submit", data=form | {"neighbours": "block, bottle block"}, follow_redirects=False)

@@ -136,8 +136,11 @@ def test_grasps_come_in_the_order_and_by_the_filters_asked_for(http: TestClient,
     query = {"hand": "allegro", "valid": "true", "min_epsilon": 0.1, "max_intersection_volume_cm3": 0.3}
     grasps = http.get("/v1/grasps", params=query).json()["items"]
     assert grasps and all(g["valid"] and g["epsilon"] >= 0.1 and g["intersection_volume_cm3"] <= 0.3 for g in grasps)
-    assert http.get("/v1/grasps", params=query | {"hand": "shadow"}).json()["items"] == []
-    assert http.get("/v1/grasps", params={"colour": "red"}).status_code == 422
+    for other in ({"hand": "shadow"}, {"scene": "any"}, {"min_clearance_m": 0.001}, {"lift_hard": "true"}):
+        assert http.get("/v1/grasps", params=query | other).json()["items"] == []
+    assert http.get("/v1/grasps", params=query | {"scene": "free"}).json()["items"] == grasps
+    for unknown in ({"colour": "red"}, {"scene": "moon"}):
+        assert http.get("/v1/grasps", params=unknown).status_code == 422
 
 
 @pytest.mark.parametrize("harm", [flip, cut, remove])

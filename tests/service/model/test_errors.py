@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from graspd.api.uploads import name_of_upload
 from graspd.exchange.plan import plain_name
-from graspd.service.index.condition import read_condition
+from graspd.service.index.database import read_condition
 from graspd.service.index.index import Index
 from graspd.service.model.base import first_error
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, without_secrets

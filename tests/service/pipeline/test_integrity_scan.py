@@ -36,20 +36,11 @@ from graspd.service.pipeline.integrity import (
 )
 from graspd.service.run.store_commands import app
 from graspd.service.settings import Settings
+from graspd.service.store import records
 from graspd.service.store.assets import pack as pack_files
 from graspd.service.store.integrity import put_document, put_sealed
 from graspd.service.store.library import builtin_assets, load_check, publish_builtins, store_files
 from graspd.service.store.manifests import ShardManifest, load_manifest
-from graspd.service.store.records import (
-    DeletedJob,
-    Deletion,
-    add_job_event,
-    latest_record,
-    publish_record,
-    put_record,
-    read_record,
-    removed_folder,
-)
 from tests.damage import flip, flipped, overwrite, remove
 from tests.fakes import HAND_FILES, OBJECT_FILES, make_shard, message_for, request, tasks_of, with_settings
 from tests.indexes import open_services
@@ -66,33 +57,35 @@ def full(services: Services) -> Services:
     """A store with an object of every kind."""
     store = services.store
     job, _ = job_actions.submit(services, request(grasps=96))
-    record = read_record(JobRecord, store, names.job_record_key(job.id))
+    record = records.read_record(JobRecord, store, names.job_record_key(job.id))
     lone, first, _ = tasks_of(record)
     services.index.write.add_manifests([make_shard(store, lone)])
-    add_job_event(store, job.id, "cancelled")
+    records.add_job_event(store, job.id, "cancelled")
     attempt = {"task_id": first.task_id, "job_id": job.id, "stage": Stage.SYNTHESIZE, "number": 1, "kind": "Error"}
     failed = AttemptRecord(**attempt, reason="broke", worker="w", ended=timestamp(), last=False)
-    put_record(store, names.attempt_key(first.task_id, 1), failed)
+    records.put_record(store, names.attempt_key(first.task_id, 1), failed)
     actions.create(services, DatasetRequest(name="all", hands=["gripper"], objects=["ball"], grasps=96))
     services.index.write_dataset.set_progress("all", planned=True)
     actions.cancel(services, "all")
     actions.take_snapshot(services, "all")
     actions.add_object_set(services, "balls", ["ball"])
-    put_record(store, f"{names.DELETIONS}/job/{'e' * 32}.json", Deletion(what="job", id="e" * 32, at=timestamp()))
-    put_record(store, f"{names.RELEASED}/1-{job.id}.json", DeletedJob(at=timestamp(), job=record))
-    gone = Deletion(what="job", id="b" * 32, at=timestamp())
-    put_record(store, f"{removed_folder(gone)}/deletion.json", gone)
-    put_record(store, f"{removed_folder(gone)}/{names.job_record_key(gone.id)}", record)
-    put_record(store, f"{names.SERVICE}/000001.json", ServiceRecord(id="c" * 32, at=timestamp()))
+    records.put_record(
+        store, f"{names.DELETIONS}/job/{'e' * 32}.json", records.Deletion(what="job", id="e" * 32, at=timestamp())
+    )
+    records.put_record(store, f"{names.RELEASED}/1-{job.id}.json", records.DeletedJob(at=timestamp(), job=record))
+    gone = records.Deletion(what="job", id="b" * 32, at=timestamp())
+    records.put_record(store, f"{records.removed_folder(gone)}/deletion.json", gone)
+    records.put_record(store, f"{records.removed_folder(gone)}/{names.job_record_key(gone.id)}", record)
+    records.put_record(store, f"{names.SERVICE}/000001.json", ServiceRecord(id="c" * 32, at=timestamp()))
     put_document(store, names.mark_key("d" * 32), {"at": timestamp()})
     hand = services.index.assets.get(AssetKind.HAND, "gripper").digest
     put_document(store, names.asset_key(AssetKind.HAND, hand, "expanded.json"), {"urdf": "<robot name='claw'/>"})
     hook = Webhook(id="f" * 32, url="https://example.org/", states=("succeeded",), created=timestamp())
-    put_record(store, names.webhook_key(hook.id), hook)
+    records.put_record(store, names.webhook_key(hook.id), hook)
     tag = Tag(id="a" * 32, name="good", number=1, created=timestamp(), changed=timestamp())
-    put_record(store, names.tag_version_key(tag.id, 1), tag)
+    records.put_record(store, names.tag_version_key(tag.id, 1), tag)
     for kind in ("charts", "scene_charts/table", "stability"):
-        publish_record(store, kind, {"created": timestamp(), "runs": [1.0, 2.0]})
+        records.publish_record(store, kind, {"created": timestamp(), "runs": [1.0, 2.0]})
     publish_builtins(store)
     ball = services.index.assets.get(AssetKind.OBJECT, "ball").digest
     file = io.BytesIO()
@@ -140,7 +133,7 @@ def test_what_an_earlier_graspd_wrote_is_read_and_counted(services: Services) ->
     services.store.put(key, found.model_dump_json().encode())
     zipped = names.asset_key(AssetKind.OBJECT, services.index.assets.get(AssetKind.OBJECT, "ball").digest, "files.zip")
     overwrite(services.store, zipped, pack_files(OBJECT_FILES))
-    assert read_record(ObjectSet, services.store, key) == found
+    assert records.read_record(ObjectSet, services.store, key) == found
     assert [wrong for _, wrong in scan(services.store, unsealed=without.append) if wrong is not None] == []
     assert {key, zipped} <= set(without)
 
@@ -183,9 +176,9 @@ def test_what_comes_with_graspd_is_put_again(services: Services) -> None:
 
 def test_charts_of_one_moment_are_all_kept(services: Services) -> None:
     at = timestamp()
-    keys = [publish_record(services.store, "charts", {"created": at, "runs": [number]}) for number in range(12)]
+    keys = [records.publish_record(services.store, "charts", {"created": at, "runs": [number]}) for number in range(12)]
     assert len(set(keys)) == 12
-    found = latest_record(services.store, "charts")
+    found = records.latest_record(services.store, "charts")
     assert found is not None and found["runs"] == [11]
 
 

@@ -54,11 +54,6 @@ def test_an_error_is_one_line_and_an_exit_code(error: BaseException, code: int, 
     assert capsys.readouterr().err == line
 
 
-def test_a_bug_is_not_dressed_up_as_a_mistake() -> None:
-    with pytest.raises(ZeroDivisionError):
-        report_errors(lambda: 1 / 0)()
-
-
 def test_a_bad_setting_names_its_variable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GRASPD_LEASE_S", "soon")
     with pytest.raises(InputError, match=r"^GRASPD_LEASE_S: "):

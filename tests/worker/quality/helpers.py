@@ -9,7 +9,6 @@ import trimesh
 from graspd.worker.control.postures import pregrasp, squeeze
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel, PalmFrame
-from graspd.worker.hands.surface import farthest_points
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import Scene
 from tests.worker.models import object_from_mesh, piece, two_finger_hand
@@ -70,13 +69,6 @@ def placed_data(scene: Scene, joints: np.ndarray, pose: np.ndarray = FAR) -> muj
     scene.set_posture(data, pose, joints)
     mujoco.mj_forward(scene.model, data)
     return data
-
-
-def choose_contacts(near: np.ndarray, place: np.ndarray, normal: np.ndarray, *, scale: float, limit: int) -> np.ndarray:
-    index = np.flatnonzero(near)
-    if len(index) <= limit:
-        return index
-    return index[farthest_points(np.hstack([place[index] / scale, normal[index]]), limit)]
 
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))

@@ -20,6 +20,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 from graspd.api.uploads import files_of_upload
 from graspd.service.model import names
@@ -140,6 +141,13 @@ def test_a_finding_stands_whatever_its_picture_costs(context: TaskContext, monke
         assert ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context) == ({"verdict": "accept"}, b"")
     child_does(monkeypatch, f"with open(sys.argv[1], 'w') as file: file.write({finding[:5]!r})\n{end}")
     assert ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)[0]["verdict"] == "refuse"
+
+
+def test_a_file_in_wrong_units_is_refused_with_a_picture(context: TaskContext) -> None:
+    block = {"block.stl": trimesh.creation.box((60.0, 40.0, 50.0)).export(file_type="stl"), "asset.json": b"{}"}
+    found, model = ingest.check_in_child(AssetKind.OBJECT, "t", block, context)
+    assert found["verdict"] == "refuse" and found["facts"]["units_suggested"][0] == "mm"
+    assert np.ptp(trimesh.load(io.BytesIO(model), file_type="glb").bounds, axis=0) == pytest.approx([0.06, 0.04, 0.05])
 
 
 def test_the_child_knows_no_credentials(context: TaskContext, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -205,7 +205,13 @@ def read_stl(data: bytes) -> Soup:
     if held == declared:
         return _read_binary_stl(data, declared)
     if b"\0" not in data[:1024] and (_FACET.search(data) or b"endsolid" in data[-1024:].lower()):
-        return _read_ascii_stl(data)
+        rows = _VERTEX.findall(data)
+        check_face_count(len(rows) // 3)
+        if len(rows) % 3:
+            raise MeshError("truncated: the last facet has fewer than three vertices")
+        if (loops := len(_LOOP.findall(data))) and 3 * loops != len(rows):
+            raise MeshError("facets of more than three vertices; triangulate the mesh and export it again")
+        return _soup(np.array(rows, dtype="S32").astype(float).reshape(-1, 3))
     if len(data) < _HEADER:
         raise MeshError(f"{len(data)} bytes are too few for an STL file; it is truncated")
     if b"\0" not in data[:1024]:
@@ -219,16 +225,6 @@ def read_stl(data: bytes) -> Soup:
 def _read_binary_stl(data: bytes, count: int) -> Soup:
     check_face_count(count)
     return _soup(np.frombuffer(data, _RECORD, count=count, offset=_HEADER)["corners"].reshape(-1, 3).astype(float))
-
-
-def _read_ascii_stl(data: bytes) -> Soup:
-    rows = _VERTEX.findall(data)
-    check_face_count(len(rows) // 3)
-    if len(rows) % 3:
-        raise MeshError("truncated: the last facet has fewer than three vertices")
-    if (loops := len(_LOOP.findall(data))) and 3 * loops != len(rows):
-        raise MeshError("facets of more than three vertices; triangulate the mesh and export it again")
-    return _soup(np.array(rows, dtype="S32").astype(float).reshape(-1, 3))
 
 
 def stl_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:

@@ -23,17 +23,6 @@ _Primitive = tuple[np.ndarray, np.ndarray, str]
 
 def read(data: bytes, nearby: Nearby = no_files) -> Soup:
     """Read vertices and triangles; every instance of a mesh in the node tree is its own copy."""
-    root = _parse(data)
-    library = _Library(root, nearby)
-    soup = join_parts(
-        (points, triangles, matrix, library.colour(bound.get(symbol, symbol)), ())
-        for geometry, matrix, bound in _instances(root, library)
-        for points, triangles, symbol in library.primitives(geometry)
-    )
-    return replace(soup, vertices=soup.vertices * _metres_per_unit(root))
-
-
-def _parse(data: bytes) -> Element:
     try:
         root: Element = SafeTree.fromstring(data)
     except DefusedXmlException:
@@ -46,15 +35,17 @@ def _parse(data: bytes) -> Element:
             element.tag = element.tag.rpartition("}")[2]
     if root.tag != "COLLADA":
         raise MeshError(f"the XML root is <{root.tag[:40]}>, but a DAE file begins with <COLLADA>")
-    return root
-
-
-def _metres_per_unit(root: Element) -> float:
+    library = _Library(root, nearby)
+    soup = join_parts(
+        (points, triangles, matrix, library.colour(bound.get(symbol, symbol)), ())
+        for geometry, matrix, bound in _instances(root, library)
+        for points, triangles, symbol in library.primitives(geometry)
+    )
     unit = root.find("asset/unit")
     metres = float(unit.get("meter", "1")) if unit is not None else 1.0
     if not 1e-9 < metres < 1e9:
         raise MeshError(f"its unit is {metres:g} m; export in metres")
-    return metres
+    return replace(soup, vertices=soup.vertices * metres)
 
 
 class _Library:

@@ -198,9 +198,12 @@ def material_colour(document: dict[str, Any], binary: bytes, primitive: dict[str
         material = document["materials"][int(primitive["material"])]["pbrMetallicRoughness"]
         factor = np.array(material.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0)), float)[:3].reshape(3)
         if "baseColorTexture" in material:
-            colour = from_linear(
-                _to_linear(_mean_texture_colour(document, binary, material["baseColorTexture"])) * factor
-            )
+            image = document["images"][int(document["textures"][int(material["baseColorTexture"]["index"])]["source"])]
+            view = document["bufferViews"][int(image["bufferView"])]
+            start = int(view.get("byteOffset", 0))
+            if start < 0 or view.get("buffer", 0) != 0:
+                raise ValueError("the image is not in the file")
+            colour = from_linear(_to_linear(mean_colour(binary[start : start + int(view["byteLength"])])) * factor)
         elif "baseColorFactor" in material:
             colour = from_linear(factor)
         else:
@@ -209,16 +212,6 @@ def material_colour(document: dict[str, Any], binary: bytes, primitive: dict[str
         # A picture does not affect the shape: an unreadable one is left out.
         return _UNKNOWN
     return np.clip(colour, 0, 1) if np.isfinite(colour).all() else _UNKNOWN
-
-
-def _mean_texture_colour(document: dict[str, Any], binary: bytes, texture: dict[str, Any]) -> Floats:
-    """Return the sRGB mean (3,) of an image in the file."""
-    image = document["images"][int(document["textures"][int(texture["index"])]["source"])]
-    view = document["bufferViews"][int(image["bufferView"])]
-    start = int(view.get("byteOffset", 0))
-    if start < 0 or view.get("buffer", 0) != 0:
-        raise ValueError("the image is not in the file")
-    return mean_colour(binary[start : start + int(view["byteLength"])])
 
 
 def _to_linear(colour: Floats) -> Floats:

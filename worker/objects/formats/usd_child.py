@@ -108,7 +108,18 @@ class _Reader:
             state["purpose"] = state["purpose"] or (self._value(prim, "purpose") if stated else "")
         self._visit_physics(prim, matrix, state)
         if instancer := self.geom.PointInstancer(prim):
-            self._visit_instances(instancer, matrix, state, depth)
+            # The prototype of each instance applies its own transform itself.
+            indices, paths = instancer.GetProtoIndicesAttr().Get(self.time), instancer.GetPrototypesRel().GetTargets()
+            count = len(indices or [])
+            if self.prims + count > _MAX_PRIMS:
+                raise InputError(f"{count} instances; at most {_MAX_PRIMS} prims are taken: export one asset")
+            options = (self.geom.PointInstancer.ExcludeProtoXform, self.geom.PointInstancer.ApplyMask)
+            placed = instancer.ComputeInstanceTransformsAtTime(self.time, self.time, *options) if count else []
+            mask = instancer.ComputeMaskAtTime(self.time) or [True] * count
+            kept = [int(index) for index, shown in zip(indices or [], mask, strict=True) if shown]
+            for index, transform in zip(kept, placed, strict=True):
+                prototype = self.stage.GetPrimAtPath(paths[index])
+                self._visit(prototype, matrix @ _matrix(transform), state, depth + 1)
             return
         if self.geom.Gprim(prim):
             self._add_shape(prim, matrix, state)
@@ -131,20 +142,6 @@ class _Reader:
             state["massed"] = mass > 0
         if joint := physics.Joint(prim):
             self.facts["joints"].append(self._joint(joint))
-
-    def _visit_instances(self, instancer: Any, matrix: np.ndarray, state: dict[str, Any], depth: int) -> None:
-        """Visit the prototype of each instance, which applies its own transform itself."""
-        indices, paths = instancer.GetProtoIndicesAttr().Get(self.time), instancer.GetPrototypesRel().GetTargets()
-        count = len(indices or [])
-        if self.prims + count > _MAX_PRIMS:
-            raise InputError(f"{count} instances; at most {_MAX_PRIMS} prims are taken: export one asset")
-        options = (self.geom.PointInstancer.ExcludeProtoXform, self.geom.PointInstancer.ApplyMask)
-        placed = instancer.ComputeInstanceTransformsAtTime(self.time, self.time, *options) if count else []
-        mask = instancer.ComputeMaskAtTime(self.time) or [True] * count
-        kept = [int(index) for index, shown in zip(indices or [], mask, strict=True) if shown]
-        for index, transform in zip(kept, placed, strict=True):
-            prototype = self.stage.GetPrimAtPath(paths[index])
-            self._visit(prototype, matrix @ _matrix(transform), state, depth + 1)
 
     def _add_shape(self, prim: Any, matrix: np.ndarray, state: dict[str, Any]) -> None:
         kind = str(prim.GetTypeName())

@@ -383,7 +383,11 @@ class JawStarts:
         room = ROOM_M[0] + (ROOM_M[1] - ROOM_M[0]) * uniform[:, 3]
         q, middle, axis = self.jaws.nearest_postures(np.minimum(self.pairs.width[pick] + 2 * room, self.jaws.opening))
         line = (end - start) / self.pairs.width[pick][:, None]
-        ahead = _across(line, uniform[:, 2])
+        helper = np.eye(3)[np.argmin(np.abs(line), axis=1)]
+        x = np.cross(line, helper)
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        angle = 2 * np.pi * uniform[:, 2][:, None]
+        ahead = np.asarray(np.cos(angle) * x + np.sin(angle) * np.cross(line, x))
         if self.wanted.approach is not None:
             ahead = into_cone(ahead, self.wanted.approach, INNER * self.wanted.cone)
             ahead = ahead - np.einsum("ni,ni->n", ahead, line)[:, None] * line
@@ -395,15 +399,6 @@ class JawStarts:
         at = ((start + end) / 2)[:, None] - length * place[..., None] * ahead[:, None]
         pivot = at - self.obj.centre_of_mass + quat_rotate(rotation, self.hand.palm.centre - middle)[:, None]
         return hands_at_distances(pivot, rotation, q)
-
-
-def _across(line: Floats, turn: Floats) -> Floats:
-    """Return unit vectors (n, 3) perpendicular to lines (n, 3), turned by shares (n,) of a full turn."""
-    helper = np.eye(3)[np.argmin(np.abs(line), axis=1)]
-    x = np.cross(line, helper)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    angle = 2 * np.pi * turn[:, None]
-    return np.asarray(np.cos(angle) * x + np.sin(angle) * np.cross(line, x))
 
 
 def _frames(x: Floats, z: Floats) -> Floats:

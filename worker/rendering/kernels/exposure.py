@@ -89,11 +89,6 @@ def expose(
             total += wp.vec3f(visible)
             continue
         m = material_in[world, hit.shape]
-        if m.pattern == shading.CATCHER:
-            # The studio floor shows the backdrop, darkened in shadow.
-            dark = (1.0 - visible) * wp.min(1.0, 2.0 * cosine) * (0.16 * one.lamp_weight + 0.14 * one.sky_weight)
-            total += shading.backdrop(light, direction) * (1.0 - dark)
-            continue
         # Noise is the largest cost: it is computed once per pixel and reused for passes that hit the same shape.
         colour = albedo
         if k == 0 or m.pattern == shading.TILES or seen != hit.shape:

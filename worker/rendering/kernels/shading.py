@@ -2,7 +2,7 @@
 
 import warp as wp
 
-PLAIN, GRAIN, SPECKLE, TILES, CATCHER = 0, 1, 2, 3, 4
+PLAIN, GRAIN, SPECKLE, TILES = 0, 1, 2, 3
 
 
 @wp.struct

@@ -91,14 +91,6 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class MotionLimits:
-    """Limits of the object's motion since the start: reaching one of them is a loss."""
-
-    displacement_m: float
-    rotation: float  # [rad]
-
-
-@dataclass(frozen=True)
 class Trial:
     """One grasp. World frame: that of the scene, or of the object at the start if there are no supports."""
 
@@ -107,7 +99,6 @@ class Trial:
     joints: Floats  # (L,) joint positions by link at the start; also the first targets
     closing: Motion  # from pregrasp through grasp to squeeze
     tests: tuple[Motion, ...]  # each starts from the closed hand: six pushes, or one lift with its hold
-    limits: MotionLimits
 
 
 class Simulation(Protocol):

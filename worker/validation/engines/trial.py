@@ -20,7 +20,6 @@ from graspd.worker.validation.engines import port
 from graspd.worker.validation.lift import RISING, RISING_S, SMOOTHLY
 from graspd.worker.validation.model import Scene, interpolate_postures
 
-LIMITS: Final = port.MotionLimits(protocol.MAX_DISPLACEMENT_M, protocol.MAX_ROTATION)
 _COUNT: Final = round(protocol.HOLD_S / protocol.INTERVAL_S)
 
 
@@ -131,7 +130,7 @@ def trial_of(scene: Scene, grasps: GraspSet, row: int, placed: PlacedGrasps | No
         rise = np.concatenate([SMOOTHLY, np.ones(_COUNT)])[:, None] * RISE_M * UP
         tests = (_rest(closing, rise, np.concatenate([np.full(RISING, RISING_S), hold]), weight),)
     centre = compose(world, np.array([*scene.centre, 1, 0, 0, 0]))
-    return port.Trial(centre, root[0], joints[0], closing, tests, LIMITS)
+    return port.Trial(centre, root[0], joints[0], closing, tests)
 
 
 def _targets(hand: HandModel, world: Floats, path: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
@@ -175,7 +174,7 @@ class _Checks:
         self, simulation: port.Simulation, trial: port.Trial, centre: Floats, rollout: protocol.Rollout, early: bool
     ) -> None:
         self._early = early
-        self._simulation, self._limits, self._centre, self._rollout = simulation, trial.limits, centre, rollout
+        self._simulation, self._centre, self._rollout = simulation, centre, rollout
         self._start, self._place = trial.object_pose, self._position(trial.object_pose)
 
     def run(self, motion: port.Motion, *, last: bool = False) -> protocol.Outcome:
@@ -193,7 +192,7 @@ class _Checks:
             if (outcome := self._outcome(moved)) is not protocol.Outcome.HELD:
                 break
             ahead = moved + protocol.AHEAD * left / float(seconds) * (moved - before)
-            if self._early and number > resting and _excess(ahead, self._limits) < protocol.SURE:
+            if self._early and number > resting and _excess(ahead) < protocol.SURE:
                 break
             before = moved
         return outcome
@@ -211,12 +210,13 @@ class _Checks:
     def _outcome(self, moved: Floats) -> protocol.Outcome:
         if not np.isfinite(moved).all():
             return protocol.Outcome.DIVERGED
-        self._rollout.margin = max(self._rollout.margin, _excess(moved, self._limits))
-        if not np.linalg.norm(moved[:3]) < self._limits.displacement_m:
+        self._rollout.margin = max(self._rollout.margin, _excess(moved))
+        if not np.linalg.norm(moved[:3]) < protocol.MAX_DISPLACEMENT_M:
             return protocol.Outcome.DISPLACED
-        return protocol.Outcome.HELD if moved[3] < self._limits.rotation else protocol.Outcome.ROTATED
+        return protocol.Outcome.HELD if moved[3] < protocol.MAX_ROTATION else protocol.Outcome.ROTATED
 
 
-def _excess(moved: Floats, limits: port.MotionLimits) -> float:
+def _excess(moved: Floats) -> float:
     """Return the larger ratio of displacement or rotation to its limit."""
-    return max(float(np.linalg.norm(moved[:3])) / limits.displacement_m, float(moved[3]) / limits.rotation)
+    displacement, turn = float(np.linalg.norm(moved[:3])), float(moved[3])
+    return max(displacement / protocol.MAX_DISPLACEMENT_M, turn / protocol.MAX_ROTATION)

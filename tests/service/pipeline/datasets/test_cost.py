@@ -4,19 +4,8 @@ from typing import Any
 
 import pytest
 
+from graspd.service.index.queries import rates
 from graspd.service.index.queries.overview import BatchCost
-from graspd.service.index.queries.rates import (
-    ORIGIN,
-    STORED,
-    STORED_EPISODE,
-    STORED_FILM,
-    STORED_MODEL_S,
-    STORED_OTHER,
-    STORED_PLACE,
-    Machine,
-    episode_rate,
-    measure_machine,
-)
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import NotFoundError
 from graspd.service.model.states import Stage
@@ -92,19 +81,19 @@ def test_another_recipe_is_not_measured_by_this_one(services: Services) -> None:
     others = ({"method": "graspit"}, annealed | {"fidelity": "draft"}, annealed | {"validation": "fast"})
     for changes in (*others, annealed | {"want": "candidates"}):
         found = estimate(services.index, wanted(**changes))
-        assert all(rate.origin.startswith(ORIGIN) for rate in found.rates) and found.measured_share == 0
+        assert all(rate.origin.startswith(rates.ORIGIN) for rate in found.rates) and found.measured_share == 0
 
 
 def test_one_measured_fidelity_scales_the_stored_rates_of_all(services: Services) -> None:
     """So fidelities stand in the order of their cost; and so do scenes and pictures."""
     fresh = estimate(services.index, wanted(scenes=2, views=2)).seconds_by_stage
     done = run(services)
-    factor = done.rates[0].seconds_per_try / STORED["standard"][0]
+    factor = done.rates[0].seconds_per_try / rates.STORED["standard"][0]
     assert done.machine_factor == pytest.approx(factor)
     for changes, stored in (
-        ({"fidelity": "draft"}, STORED["draft"]),
-        ({"fidelity": "fine"}, STORED["fine"]),
-        ({"method": "graspit"}, STORED_OTHER["graspit"]),
+        ({"fidelity": "draft"}, rates.STORED["draft"]),
+        ({"fidelity": "fine"}, rates.STORED["fine"]),
+        ({"method": "graspit"}, rates.STORED_OTHER["graspit"]),
     ):
         (rate,) = {rate.seconds_per_try for rate in estimate(services.index, wanted(**changes)).rates}
         assert rate == pytest.approx(factor * stored[0])
@@ -132,7 +121,7 @@ def test_an_interval_holds_the_estimate_and_shrinks(services: Services) -> None:
 def test_batches_that_differ_widen_the_interval() -> None:
     of, sizes = ("claw", "cube", "cpu", JobRequest(hand="claw", object="cube")), (32, 32, 32, 1000)
     both = ([BatchCost(*of, one, *sizes) for one in times] for times in ((5.0, 5.0, 5.0), (1.0, 5.0, 25.0)))
-    even, uneven = map(measure_machine, both)
+    even, uneven = map(rates.measure_machine, both)
     assert even.factor == uneven.factor
     assert uneven.stored_spread[0] < even.stored_spread[0] < even.stored_spread[1] < uneven.stored_spread[1]
 
@@ -140,14 +129,14 @@ def test_batches_that_differ_widen_the_interval() -> None:
 @pytest.mark.parametrize(
     ("changes", "words", "stored"),
     [
-        ({"fidelity": {"starts": 3}}, "value of standard (none for custom)", STORED["standard"]),
-        ({"method": "mine"}, "value of fast_graspd (none for mine)", STORED["standard"]),
-        ({"method": "graspit"}, "graspit", STORED_OTHER["graspit"]),
+        ({"fidelity": {"starts": 3}}, "value of standard (none for custom)", rates.STORED["standard"]),
+        ({"method": "mine"}, "value of fast_graspd (none for mine)", rates.STORED["standard"]),
+        ({"method": "graspit"}, "graspit", rates.STORED_OTHER["graspit"]),
     ],
 )
 def test_what_nobody_measured_says_what_stands_in(services: Services, changes: Any, words: str, stored: Any) -> None:
     found = estimate(services.index, wanted(**changes))
-    assert {(rate.origin, rate.seconds_per_try) for rate in found.rates} == {(f"{ORIGIN}, {words}", stored[0])}
+    assert {(rate.origin, rate.seconds_per_try) for rate in found.rates} == {(f"{rates.ORIGIN}, {words}", stored[0])}
 
 
 def test_a_million_grasps_on_one_eight_and_sixty_four_workers(services: Services) -> None:
@@ -177,7 +166,7 @@ def test_grasps_in_scenes_have_a_price_of_their_own(services: Services) -> None:
     stored = estimate(services.index, wanted(scene="table", scenes=2))
     assert {rate.batches for rate in stored.rates} == {0} and all("in a scene" in rate.origin for rate in stored.rates)
     assert stored.candidates > estimate(services.index, wanted(scenes=2)).candidates
-    assert stored.storage_by_kind["scene"] == 4 * 2 * STORED_PLACE.size_bytes
+    assert stored.storage_by_kind["scene"] == 4 * 2 * rates.STORED_PLACE.size_bytes
     done(services, "placed", scene="table", scenes=2)
     placed = estimate(services.index, wanted(scene="table", scenes=2))
     assert placed.measured_share == 1 and placed.seconds_by_stage["scene"] == pytest.approx(4 * FAKE_SECONDS)
@@ -189,26 +178,28 @@ def test_an_episode_costs_as_stored_then_as_one_of_the_same_robot_and_cameras() 
         BatchCost("h", "o", "cpu", made, seconds, count, count, count, size)
         for seconds, count, size in ((8.0, 4, 40_000), (0.1, 0, 9))
     ]
-    rates = {
-        robot: episode_rate(batches, JobOptions(scene="table", episodes=robot, film=film), Machine(factor=2.0))
+    found = {
+        robot: rates.episode_rate(
+            batches, JobOptions(scene="table", episodes=robot, film=film), rates.Machine(factor=2.0)
+        )
         for robot, film in (("flying", ()), ("franka", ("scene", "wrist")))
     }
-    assert (rates["flying"].seconds, rates["flying"].size_bytes, rates["flying"].batches) == (2.0, 10_000, 1)
-    stored = [one + 2 * film for one, film in zip(STORED_EPISODE, STORED_FILM, strict=True)]
-    assert [rates["franka"].seconds / 2, rates["franka"].size_bytes] == stored
+    assert (found["flying"].seconds, found["flying"].size_bytes, found["flying"].batches) == (2.0, 10_000, 1)
+    stored = [one + 2 * film for one, film in zip(rates.STORED_EPISODE, rates.STORED_FILM, strict=True)]
+    assert [found["franka"].seconds / 2, found["franka"].size_bytes] == stored
 
 
 def test_an_estimate_has_the_stage_of_episodes(services: Services) -> None:
     plain, filmed = (estimate(services.index, wanted(scene="table", **more)) for more in ({}, {"episodes": "flying"}))
     assert filmed.tasks - plain.tasks == plain.cells
     assert filmed.seconds - plain.seconds == pytest.approx(filmed.seconds_by_stage[Stage.EPISODE])
-    assert filmed.seconds_by_stage[Stage.EPISODE] == pytest.approx(plain.valid * STORED_EPISODE[0], rel=0.01)
+    assert filmed.seconds_by_stage[Stage.EPISODE] == pytest.approx(plain.valid * rates.STORED_EPISODE[0], rel=0.01)
     assert filmed.storage_by_kind["episodes"] > 0
 
 
 def test_other_models_cost_what_they_take_of_each_valid_grasp(services: Services) -> None:
     told = [estimate(services.index, wanted(**models)) for models in ({}, {"robust": 0.9}, {"robust_models": 16})]
     none, eight, sixteen = (one.seconds_by_stage["synthesize"] for one in told)
-    assert eight - none == pytest.approx(8 * STORED_MODEL_S * told[0].valid, rel=0.01)
+    assert eight - none == pytest.approx(8 * rates.STORED_MODEL_S * told[0].valid, rel=0.01)
     assert sixteen - none == pytest.approx(2 * (eight - none), rel=0.01)
     assert all("16 models" in rate.origin for rate in told[2].rates)

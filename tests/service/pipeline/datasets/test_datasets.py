@@ -26,14 +26,7 @@ from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.export import Fetch, export_shards, path_of
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.fidelity_choice import FidelityResolver
-from graspd.service.store.records import (
-    job_events,
-    load_dataset,
-    load_snapshot,
-    publish_record,
-    put_record,
-    scene_chart_kind,
-)
+from graspd.service.store import records
 from graspd.service.store.store import open_store
 from tests.fakes import finish, plan_all, record_of
 from tests.service.pipeline.datasets.makers import add_asset, cells_of, done, fail, jobs_of, wanted
@@ -86,7 +79,7 @@ def test_records_of_an_older_graspd_are_read_and_are_the_same_dataset(services: 
     stored = json.loads(services.store.get(names.dataset_record_key("grasps")))
     stored["options"] = {k: v for k, v in stored["options"].items() if k not in ("options", "target")}
     del stored["fidelities"]
-    assert DatasetRecord.model_validate(stored) == load_dataset(services.store, "grasps")
+    assert DatasetRecord.model_validate(stored) == records.load_dataset(services.store, "grasps")
 
 
 def test_a_dataset_keeps_the_versions_it_was_created_with(services: Services) -> None:
@@ -206,8 +199,8 @@ def test_an_event_reaches_a_job_once(services: Services) -> None:
     rebuild(services.index, services.store)  # forgets how far the planner was
     plan_all(services)
     assert services.index.jobs.get(started).state == "queued"
-    assert [event.what for event in job_events(services.store, started)] == ["cancelled", "retried"]
-    assert [event.what for event in job_events(services.store, jobs_of(services, "grasps")[1])] == ["cancelled"]
+    assert [event.what for event in records.job_events(services.store, started)] == ["cancelled", "retried"]
+    assert [event.what for event in records.job_events(services.store, jobs_of(services, "grasps")[1])] == ["cancelled"]
 
 
 def test_the_store_alone_tells_everything(either: Services) -> None:
@@ -239,7 +232,7 @@ def test_a_set_has_versions_and_the_newest_counts(either: Services) -> None:
 
 def test_a_set_that_broke_off_keeps_its_name_in_its_project(services: Services) -> None:
     left = create_object_set("round", ["ball"], project="blue")
-    put_record(services.store, names.object_set_key("round", left.digest), left)
+    records.put_record(services.store, names.object_set_key("round", left.digest), left)
     with pytest.raises(errors.ConflictError, match="take another name"):
         actions.add_object_set(services, "round", ["ball"], scope=ProjectScope("", everything=False))
 
@@ -260,7 +253,7 @@ def test_the_same_shards_are_the_same_snapshot(services: Services) -> None:
     assert new and last.complete and last.digest != first.digest
     assert [(shard.hand, shard.object) for shard in last.shards][1:3] == [("gripper", "cube"), ("claw", "ball")]
     assert last.size_bytes == sum(services.store.size(shard.key) for shard in last.shards)
-    assert load_snapshot(services.store, "grasps", first.digest) == first
+    assert records.load_snapshot(services.store, "grasps", first.digest) == first
 
 
 @pytest.fixture
@@ -351,7 +344,7 @@ def test_options_of_the_method_are_those_of_each_cells_job(either: Services) -> 
 
 
 def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Services) -> None:
-    publish_record(either.store, "charts", chart())
+    records.publish_record(either.store, "charts", chart())
     actions.create(either, wanted(**AUTO))
     assert [(r.fidelity, r.target) for r in requests_of(either)] == [(fidelity, "") for fidelity in CHOSEN]
     assert [cell.fidelity for cell in either.index.datasets.cells("grasps").items] == CHOSEN
@@ -361,20 +354,20 @@ def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Service
 
 
 def test_a_later_chart_changes_nothing_of_a_dataset(services: Services) -> None:
-    publish_record(services.store, "charts", chart())
+    records.publish_record(services.store, "charts", chart())
     actions.create(services, wanted(**AUTO))
     before = jobs_of(services, "grasps")
     actions.create(services, wanted("named", fidelity="fine"))
     assert before[2:] == jobs_of(services, "named")[2:], "each is the job of that fidelity"
-    publish_record(services.store, "charts", chart("2026-11-21T11:00:00.000Z", claw="draft"))
+    records.publish_record(services.store, "charts", chart("2026-11-21T11:00:00.000Z", claw="draft"))
     _, new = actions.create(services, wanted(**AUTO))
     assert not new and jobs_of(services, "grasps") == before
-    publish_record(services.store, "charts", {"created": "2026-11-21T12:00:00.000Z", "runs": []})
+    records.publish_record(services.store, "charts", {"created": "2026-11-21T12:00:00.000Z", "runs": []})
     assert actions.create(services, wanted(**AUTO))[1] is False
 
 
 def test_auto_costs_what_it_chooses_and_needs_a_target_within_reach(services: Services) -> None:
-    publish_record(services.store, "charts", chart())
+    records.publish_record(services.store, "charts", chart())
     with pytest.raises(errors.InputError, match=r"no fidelity of fast_graspd meets gsr>=0\.75"):
         actions.create(services, wanted(**AUTO | {"target": "gsr>=0.75"}))
     assert not services.store.exists(names.dataset_record_key("grasps"))
@@ -393,7 +386,7 @@ def test_each_cell_in_scenes_says_how_its_fidelity_was_chosen(either: Services) 
     runs = [lifts(name, speeds[name], lift, hand="gripper", object=obj) for name, obj, lift in of_each]
     place = SceneSpec(kind="table")
     created = {"created": "2026-11-21T10:00:00.000Z", "scene": place.model_dump(mode="json")}
-    key = publish_record(either.store, scene_chart_kind(place), created | {"runs": runs})
+    key = records.publish_record(either.store, records.scene_chart_kind(place), created | {"runs": runs})
     actions.create(either, wanted(fidelity="auto", target="lift>=0.9", scene="table"))
     rebuild(either.index, either.store)
     cells = either.index.datasets.cells("grasps").items
@@ -404,4 +397,4 @@ def test_each_cell_in_scenes_says_how_its_fidelity_was_chosen(either: Services) 
     ]
     plan_all(either)
     assert [record_of(either, job).choice for job in jobs_of(either, "grasps")] == [cell.choice for cell in cells]
-    assert len(load_dataset(either.store, "grasps").choices) == 3
+    assert len(records.load_dataset(either.store, "grasps").choices) == 3

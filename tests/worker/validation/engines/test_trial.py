@@ -7,7 +7,7 @@ import pytest
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats
 from graspd.worker.validation.engines.port import Motion, Trial
-from graspd.worker.validation.engines.trial import LIMITS, run_trial
+from graspd.worker.validation.engines.trial import run_trial
 from graspd.worker.validation.protocol import HOLD_S, INTERVAL_S, STAGE_S, Outcome
 
 
@@ -46,7 +46,7 @@ def outcome(drift: Drift, rise: int = 0) -> Outcome:
     root, joints = motion(len(raised))
     root[:, :3] += raised
     push = Motion(root, joints, np.repeat([0.008, INTERVAL_S], [rise, hold]), np.array([1.0, 0, 0]), raised)
-    trial = Trial(IDENTITY_POSE, IDENTITY_POSE, np.zeros(1), none, (push,), LIMITS)
+    trial = Trial(IDENTITY_POSE, IDENTITY_POSE, np.zeros(1), none, (push,))
     return run_trial(drift, trial, np.zeros(3)).outcomes[0]
 
 
