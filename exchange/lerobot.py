@@ -99,7 +99,7 @@ def episode_parts(shards: Shards, obj: str | None, *, every: bool) -> list[Episo
 
 
 def write(parts: Sequence[EpisodesPart], folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write all episodes; those of held-out objects come last. Raises InputError: the folder has a data set."""
+    """Write all episodes; those of held-out objects come last. InputError: the folder has a data set."""
     parquet.import_pyarrow()
     if (folder / "meta").exists():
         raise InputError(f"{folder} holds a data set already; give another folder as --output")

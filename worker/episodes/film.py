@@ -1,4 +1,4 @@
-"""Films of episodes: a scene camera, a wrist camera and a moving camera see robot, object and supports.
+"""Films of episodes by a scene camera, a wrist camera and a moving camera.
 
 Lights, materials and cameras are random within the ranges below and of `rendering.scene_setup.draw_*`."""
 
@@ -263,7 +263,7 @@ class EpisodeRenderer:
         return [light, wp.vec3f(*toward), structs, towards, self._array(views, raster.View)]
 
     def _motion(self, episode: Episode, poses: Floats) -> tuple[Floats, float]:
-        """Return middle and radius of a sphere around the object at start and end, and the palm before and after."""
+        """Return middle and radius of a sphere around the palm and the object at start and end."""
         hand, thing = self._robot.hand, len(self._supports)
         corners = apply(poses[[0, -1], thing, None], self._objects[0].centred.hull_vertices).reshape(-1, 3)
         roots = self._robot.poses(episode.state[episode.phase > 0])[0][1][:, 0]
@@ -396,7 +396,7 @@ def encode(pictures: NDArray[Any], fps: float) -> bytes:
 def film_maker(
     base: Shard, options: FilmOptions, seed: int, run: ExecutionContext = DEFAULT_CONTEXT
 ) -> Callable[[Robot, Executions], Callable[[Episode], Episode]]:
-    """Return a function that makes a function, for one thread, that adds films to episodes of a base shard's grasps."""
+    """Return a function that makes, for one thread, a function that adds films to an episode."""
     spec = scene_spec_of(base)
 
     def make(robot: Robot, found: Executions) -> Callable[[Episode], Episode]:

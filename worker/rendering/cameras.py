@@ -78,7 +78,7 @@ def inscribed_field_of_view(k: Floats, width: int, height: int) -> float:
 
 
 def look_at(eye: Floats, target: Floats, up: Sequence[float] | Floats = (0.0, 0.0, 1.0)) -> Floats:
-    """Return extrinsics (4, 4) of a camera at `eye` that looks at `target`, by default the table's z axis up."""
+    """Return extrinsics (4, 4) of a camera at `eye` that looks at `target`; by default, z is up."""
     forward = np.asarray(target, float) - eye
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, up)

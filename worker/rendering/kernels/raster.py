@@ -1,7 +1,8 @@
-"""Warp kernels that rasterise triangles: pictures at 2 x 2 samples per pixel, with a shadow map per direction of light.
+"""Warp kernels that rasterise triangles, with a shadow map per direction of light.
 
-A film has so many pixels that rays cost too much. Triangles are tested with homogeneous edge functions (Olano and Greer
-1997), so none is clipped. A sample's key has its depth in the upper 32 bits and its face in the lower ones."""
+Pictures have 2 x 2 samples per pixel. A film has so many pixels that rays cost too much. Triangles are tested with
+homogeneous edge functions (Olano and Greer 1997), so none is clipped. A sample's key has its depth in the upper 32 bits
+and its face in the lower ones."""
 
 import warp as wp
 
@@ -57,7 +58,7 @@ def projected(view: View, width: wp.int32, height: wp.int32, local: wp.vec3f):
 def cover(
     scene: Triangles, supports: wp.int32, first_part: wp.int32, view_in: wp.array[View], key_out: wp.array3d[wp.int64]
 ):
-    """Write keys of the nearest faces; parts before `first_part` are omitted, and back faces of the supports."""
+    """Write keys of the nearest faces, without parts before `first_part` and back faces of supports."""
     k, face = wp.tid()
     if scene.part[face] < first_part:
         return
@@ -90,18 +91,25 @@ def cover(
             at = wp.vec2f(c[0], c[1]) / _NEAR
             low = wp.min(low, at)
             high = wp.max(high, at)
-    left = wp.int32(wp.ceil(wp.max(low[0] - 0.5, 0.0)))
-    right = wp.int32(wp.floor(wp.min(high[0] - 0.5, wp.float32(width - 1))))
-    top = wp.int32(wp.ceil(wp.max(low[1] - 0.5, 0.0)))
-    bottom = wp.int32(wp.floor(wp.min(high[1] - 0.5, wp.float32(height - 1))))
-    if right < left or bottom < top:
-        return
+    left = wp.max(wp.int32(wp.ceil(wp.max(low[0] - 0.5, 0.0))), 0)
+    right = wp.min(wp.int32(wp.floor(wp.min(high[0] - 0.5, wp.float32(width - 1)))), width - 1)
+    top = wp.max(wp.int32(wp.ceil(wp.max(low[1] - 0.5, 0.0))), 0)
+    bottom = wp.min(wp.int32(wp.floor(wp.min(high[1] - 0.5, wp.float32(height - 1)))), height - 1)
     across = wp.vec3f(n0[0], n1[0], n2[0]) * side
     down = wp.vec3f(n0[1], n1[1], n2[1]) * side
     corner = wp.vec3f(n0[2], n1[2], n2[2]) * side + 0.5 * (across + down)
     for row in range(top, bottom + 1):
         start = corner + wp.float32(row) * down
-        for column in range(left, right + 1):
+        first = left
+        last = right
+        if right - left > 8:
+            # Samples outside of an edge are skipped, except one on each side because of rounding.
+            for i in range(3):
+                if across[i] > 0.0:
+                    first = wp.max(first, wp.int32(wp.clamp(-start[i] / across[i], 0.0, 1.0e5)) - 1)
+                elif across[i] < 0.0:
+                    last = wp.min(last, wp.int32(wp.clamp(-start[i] / across[i], -2.0, 1.0e5)) + 1)
+        for column in range(first, last + 1):
             e = start + wp.float32(column) * across
             if e[0] >= 0.0 and e[1] >= 0.0 and e[2] >= 0.0:
                 z = wp.dot(e, depth) / (e[0] + e[1] + e[2])
@@ -148,7 +156,7 @@ def is_dark(view: View, key_in: wp.array3d[wp.int64], k: wp.int32, point: wp.vec
     # The map's samples differ by their size: the point is moved out of its own surface.
     local = wp.transform_point(view.inverse, point + (normal + toward) * (1.2 * texel))
     at = projected(view, key_in.shape[2], key_in.shape[1], local)
-    if at[0] < 0.0 or at[1] < 0.0:
+    if not (at[0] >= 0.0 and at[1] >= 0.0):
         return False
     row = wp.int32(at[1])
     column = wp.int32(at[0])
