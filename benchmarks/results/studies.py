@@ -431,8 +431,12 @@ STUDIES: Final = (
     Study(
         "objects",
         "a published set of objects and five hands, with killed workers",
-        ("results/objects.*",),
-        ("python -m benchmarks.object_run --work WORK/objects --out OUT/results/objects.md",),
+        ("results/objects*",),
+        (
+            "python -m benchmarks.object_run --work WORK/objects --out OUT/results/objects.md",
+            "python -m benchmarks.object_run --work WORK/planners --objects 12 --grasps 4 --hands allegro --scenes "
+            "free --compared 5 --no-failures --out OUT/results/objects-planners.md",
+        ),
         ("python -m benchmarks.object_run --work WORK/objects --objects 4 --grasps 8 --out OUT/results/objects.md",),
         stages=ALL,
         seeds=(0,),

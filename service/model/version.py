@@ -17,4 +17,4 @@ SCHEMA_OF_ENGINES: Final = 8
 SCHEMA_OF_EPISODES: Final = 9
 
 #: Revision of each stage's algorithm, part of the digests of results. Increase it if the results may change.
-STAGE_REVISIONS: Final = {"synthesize": 33, "scene": 5, "render": 6, "episode": 1}
+STAGE_REVISIONS: Final = {"synthesize": 34, "scene": 5, "render": 6, "episode": 1}

@@ -57,6 +57,8 @@ FRICTION: Final = 0.3
 #: Least and largest ratio of this sum to the object's weight. With a sum of 50 N, fingertips at the upper edges of a
 #: light flat object push it out. The largest ratio gives 50 N at 0.1 kg.
 OF_WEIGHT: Final = (10.0, 50.0)
+#: Least sum [N]. With less, the squeeze moves fingers by less than the gaps at their contacts, and objects of 1 g slip.
+LEAST_NORMAL_FORCE: Final = 2.0
 
 
 def pregrasp(
@@ -129,7 +131,7 @@ def hold_forces(
 
 def normal_force(obj: ObjectModel) -> float:
     least, most = (times * ACCELERATION * obj.mass for times in OF_WEIGHT)
-    return min(max(TOTAL_NORMAL_FORCE, least), most)
+    return max(min(max(TOTAL_NORMAL_FORCE, least), most), LEAST_NORMAL_FORCE)
 
 
 def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.int32]:

@@ -4,6 +4,7 @@ The world is the scene's frame. Gravity acts on object and neighbours; hand and 
 is commanded by float32 actions at the frames of an episode. Between frames, targets move evenly, root quaternions after
 normalisation. Stored actions are the executed ones, so a replay with the same libraries is bit-identical."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final
 
@@ -33,6 +34,9 @@ ARMATURE: Final = 0.1
 #: Largest displacement of the object before the hand closes [m]; a ball rolls by up to 7 mm from its rest pose.
 TOUCHED_M: Final = 0.01
 _CLOSE, _SQUEEZE = PHASES.index("close"), PHASES.index("squeeze")
+
+#: Returns the action (D,) of a frame from its number, the state (D,) and the object's pose (7,).
+Policy = Callable[[int, Floats, Floats], Floats]
 
 
 class Simulation:
@@ -73,13 +77,20 @@ class Simulation:
             episode = replace(episode, action=repeated, phase=np.append(episode.phase, episode.phase[-1:]))
         return self._run(episode)
 
-    def _run(self, planned: Episode) -> Episode:
+    def follow(self, policy: Policy, start: Episode) -> Episode:
+        """Execute a policy from the first state of an episode on, for as many frames and with its phases."""
+        return self._run(start, policy)
+
+    def _run(self, planned: Episode, policy: Policy | None = None) -> Episode:
         """Execute all actions but the last one; after a numerical divergence there are fewer frames."""
         targets = np.concatenate([planned.state[:1], planned.action])
         controls = self._controls(targets)
         self._set_up(targets[0], controls[0], planned.scene)
         data, states, things = self.data, [targets[0]], [self._poses()]
         for frame in range(len(planned.action) - 1):
+            if policy is not None:
+                targets[frame + 1 :] = policy(frame, states[-1], things[-1][0])
+                controls[frame + 1] = self._controls(targets[frame + 1 : frame + 2])[0]
             for share in np.arange(1, self.steps + 1) / self.steps:
                 data.ctrl[:] = (1 - share) * controls[frame] + share * controls[frame + 1]
                 if self.robot.arm is None:
@@ -97,7 +108,7 @@ class Simulation:
             object_pose=poses[:, 0],
             neighbour_pose=poses[:, 1:],
             phase=planned.phase[kept],
-            action=planned.action[kept],
+            action=targets[1:][kept],
             outcome=EpisodeOutcome.DIVERGED,
         )
         return found if len(states) < len(planned.action) else replace(found, outcome=self.outcome(found))

@@ -121,3 +121,12 @@ def test_frames_are_at_equal_times_and_the_step_divides_them(fps: float) -> None
 def test_files_name_all_outcomes_and_phases() -> None:
     assert tuple(EPISODE_PHASES.values()) == PHASES
     assert list(EPISODE_OUTCOMES.values()) == [one.name.lower().replace("_", " ") for one in EpisodeOutcome]
+
+
+def test_a_policy_that_repeats_stored_actions_repeats_the_episode() -> None:
+    found = executions()
+    simulation = simulation_of(found)
+    episode = simulation.execute(motion_of(found, Robot(HAND)), 0)
+    again = simulation.follow(lambda frame, *_: episode.action[frame], replace(episode, action=0 * episode.action))
+    assert again.outcome is EpisodeOutcome.SUCCEEDED
+    assert np.array_equal(again.state, episode.state) and np.array_equal(again.action[:-1], episode.action[:-1])

@@ -136,6 +136,12 @@ def test_whoever_says_the_weight_is_told_what_the_grasps_lift(tmp_path) -> None:
         assert keys & said.keys() == told and said["mass_kg"] == 0.37 and said.get("payload_kg", 1.0) >= 0.37
 
 
+def test_half_a_gram_is_lifted_off_the_table(tmp_path) -> None:
+    told = graspd(f"{BARRETT} -n 8 --want candidates --mass 0.0005 -o", tmp_path / "g.h5")
+    # By 50 times its weight alone, 0.25 N, 7 of 8 hold, and the planner starts 24 times more.
+    assert told["valid"] == 8 and told["outcomes"].get("repeated", 0) < 12
+
+
 @pytest.mark.parametrize(("least", "kept", "outcomes"), [(0.3, 2, {}), (90.0, 0, {"weak": 2})])
 def test_a_job_counts_grasps_that_lift_the_wanted_payload(tmp_path, least, kept: int, outcomes: dict[str, int]) -> None:
     words = f"{BARRETT} -n 2 --budget 1 --mass 0.2 --min-payload {least} --shake -o"

@@ -1,0 +1,1 @@
+"""A policy cloned from episodes, beside replay of the nearest episode."""
