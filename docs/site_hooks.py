@@ -23,6 +23,7 @@ OUTSIDE: Final = {
     "CODE_OF_CONDUCT.md": "project/conduct.md",
     "CHANGELOG.md": "project/changelog.md",
     "examples/train_grasp_predictor/README.md": "how-to/example-network.md",
+    "examples/behaviour_cloning/README.md": "how-to/example-policy.md",
 }
 _INSIDE: Final = {place: source for source, place in OUTSIDE.items()}
 _CODE: Final = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)

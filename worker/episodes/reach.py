@@ -56,7 +56,7 @@ BUILTIN_ARMS: Final = {
 
 
 def read_arm(path: str | pathlib.Path, mount: str | None, hand_pose: Floats) -> Arm:
-    """Read a built-in arm, or a URDF, its folder or a ZIP, without links below the mount, such as a gripper.
+    """Read a built-in arm, or a URDF, its folder or a ZIP, without links below the mount (grippers).
     Joints that do not lead to the mount are fixed at zero, or at the nearest value inside their limits. A built-in arm
     has the mount `flange`. Raises InputError: there is no such arm, no link `mount`, or no joint moves it."""
     builtin = BUILTIN_ARMS.get(str(path))
