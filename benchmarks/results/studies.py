@@ -502,6 +502,21 @@ STUDIES: Final = (
         seeds=(404,),
     ),
     Study(
+        "episodes",
+        "episodes of table grasps by a flying hand and two arms",
+        ("results/episodes.md",),
+        (
+            "python -m benchmarks.episodes DATA --objects 011_banana 025_mug 035_power_drill 077_rubiks_cube "
+            "--grasps 12 --page OUT/results/episodes.md",
+        ),
+        (
+            "python -m benchmarks.episodes DATA --hands barrett --objects 025_mug --grasps 2 "
+            "--page OUT/results/episodes.md",
+        ),
+        IN_SCENES,
+        seeds=(1200,),
+    ),
+    Study(
         "masses",
         "table lifts of objects with published masses",
         ("results/masses.md",),
