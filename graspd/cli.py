@@ -25,7 +25,7 @@ from graspd.service.model.version import PACKAGE_VERSION
 COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("demo", "graspd.demo", "Make grasps", "Make grasps, scenes and pictures of built-in data, and a results page."),
     ("synth", "graspd.commands.synth", "Make grasps", "Generate grasps of a hand file on an object file."),
-    ("transfer", "graspd.commands.transfer", "Make grasps", "Transfer grasps of a file to another hand."),
+    ("transfer", "graspd.commands.scene", "Make grasps", "Transfer grasps of a file to another hand."),
     ("evaluate", "graspd.commands.evaluate", "Make grasps", "Validate grasps in MuJoCo, an independent engine."),
     ("scene", "graspd.commands.scene", "Make grasps", "Drop the object on a table and select clear grasps."),
     ("episodes", "graspd.commands.episodes", "Make grasps", "Execute grasps by an arm or a flying hand in MuJoCo."),

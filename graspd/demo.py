@@ -65,7 +65,7 @@ def run_job(client: Client, request: JobRequest, out: Path, console: Console) ->
     job = client.submit(request)
     console.print(f"job {job.id[:12]}: {request.grasps} grasps of {request.hand} on {request.object}")
     with JobDisplay(console) as display:
-        job = client.wait(job.id, display.update)
+        job = client.wait(job.id, display.show)
     if job.state is not State.SUCCEEDED:
         raise TaskError(f"the job {job.state.value}: {job.reason or 'no reason recorded'}")
     folder = out / "shards"

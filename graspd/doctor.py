@@ -7,7 +7,9 @@ import logging
 import os
 import sys
 import threading
+from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -64,43 +66,42 @@ def _exit(code: int) -> None:
     raise typer.Exit(code)
 
 
+#: Module, function and time limit [s] of checks whose packages an install may lack.
+_FURTHER: Final = {
+    "keys": ("graspd.api.access.doctor", "check_keys", 60.0),
+    "gpu": ("graspd.commands.doctor", "check_gpu", 125.0),
+    "kernels": ("graspd.commands.doctor", "check_kernels", 905.0),
+}
+
+
 def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
-    """Return the checks of all packages; a check of a missing package reports that it is not installed.
-
-    With `full`, all rows of the index are compared with the store.
-    """
-    full_s = _FULL_S if full else 120.0
-    checks = [
-        Check("disk", partial(machine.check_disk, settings)),
-        Check("data-folder", partial(machine.check_data_folder, settings)),
-        Check("limits", machine.check_limits),
-        Check("redis", partial(backends.check_redis, settings)),
-        Check("redis-persistence", partial(backends.check_persistence, settings)),
-        Check("store", partial(backends.check_configured_store, settings), limit_s=120.0),
-        Check("index", partial(backends.check_index, settings)),
-        Check("identity", partial(backends.check_index_identity, settings)),
-        Check("index-is-store", partial(backends.compare_index_with_store, settings, full=full), limit_s=full_s),
-        Check("damage", partial(backends.check_store_damage, settings)),
-        Check("clocks", partial(fleet.check_clocks, settings), limit_s=120.0),
-        Check("controller", partial(fleet.check_controller, settings)),
-        Check("workers", partial(fleet.check_workers, settings)),
-        Check("port", partial(fleet.check_port, settings)),
-    ]
-    if missing_extra("graspd.api"):
-        checks.append(_skipped_check("keys", "api"))
-    else:
-        from graspd.api.access.doctor import check_keys
-
-        checks.append(Check("keys", partial(check_keys, settings)))
-    if missing_extra("graspd.commands"):
-        return [*checks, _skipped_check("gpu", "worker"), _skipped_check("kernels", "worker")]
-    from graspd.commands.doctor import checks_of
-
-    return checks + checks_of(settings)
+    """Return the checks of all packages; with `full`, all rows of the index are compared with the store."""
+    compare = partial(backends.compare_index_with_store, full=full)
+    checks: dict[str, tuple[Callable[[Settings], Finding], float]] = {
+        "disk": (machine.check_disk, 60.0),
+        "data-folder": (machine.check_data_folder, 60.0),
+        "limits": (lambda _: machine.check_limits(), 60.0),
+        "redis": (backends.check_redis, 60.0),
+        "redis-persistence": (backends.check_persistence, 60.0),
+        "store": (backends.check_configured_store, 120.0),
+        "index": (backends.check_index, 60.0),
+        "identity": (backends.check_index_identity, 60.0),
+        "index-is-store": (compare, _FULL_S if full else 120.0),
+        "damage": (backends.check_store_damage, 60.0),
+        "clocks": (fleet.check_clocks, 120.0),
+        "controller": (fleet.check_controller, 60.0),
+        "workers": (fleet.check_workers, 60.0),
+        "port": (fleet.check_port, 60.0),
+        **{name: (partial(_look, module, function), limit_s) for name, (module, function, limit_s) in _FURTHER.items()},
+    }
+    return [Check(name, partial(look, settings), limit_s) for name, (look, limit_s) in checks.items()]
 
 
-def _skipped_check(name: str, extra: str) -> Check:
-    return Check(name, lambda: skipped(f"graspd[{extra}] is not part of this install"))
+def _look(module: str, function: str, settings: Settings) -> Finding:
+    if extra := missing_extra(module):
+        return skipped(f"graspd[{extra}] is not part of this install")
+    found: Finding = getattr(import_module(module), function)(settings)
+    return found
 
 
 def _select(checks: list[Check], only: str | None) -> list[Check]:

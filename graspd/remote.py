@@ -155,5 +155,5 @@ class Job:
 
     def cancel(self) -> Self:
         """Cancel the job; finished shards remain."""
-        self._said = self._http.cancel(self.id)
+        self._said = self._http.request(JobDetail, "POST", request_path("jobs", self.id, "cancel"))
         return self

@@ -26,14 +26,18 @@ def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[...
         added = option_rows(model, place)
         own = list(inspect.signature(command, eval_str=True).parameters.values())
         at = [parameter.name for parameter in own].index("options")
-        parameters = [*own[:at], *map(_option_parameter, added), *own[at + 1 :]]
-        parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
-        del wrapper.__wrapped__  # The signature of the original command differs.
-        wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-        return wrapper
+        return set_parameters(wrapper, [*own[:at], *map(_option_parameter, added), *own[at + 1 :]])
 
     return decorate
+
+
+def set_parameters(wrapper: Callable[..., None], parameters: Iterable[inspect.Parameter]) -> Callable[..., None]:
+    """Return a wrapper of a command with parameters of its own, all by keyword, for the command line."""
+    del wrapper.__wrapped__  # type: ignore[attr-defined]  # The signature of the original command differs.
+    shown = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
+    wrapper.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+    wrapper.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
+    return wrapper
 
 
 def _option_parameter(row: OptionRow) -> inspect.Parameter:

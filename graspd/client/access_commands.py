@@ -10,8 +10,8 @@ import typer
 
 from graspd.api.access.keys import KeyFile, KeyLimits, ProjectLimits, Scope
 from graspd.api.formatting import minute
-from graspd.client.client import request_path
-from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, report_deletion
+from graspd.client.client import Client, request_path
+from graspd.client.reports import ClientGroup, YesOption, delete, print_rows
 from graspd.service.cli import CommandGroup, JsonFlag, load_settings, print_result
 from graspd.service.command_options import with_options
 from graspd.service.model.errors import InputError
@@ -59,18 +59,15 @@ def rotate_key(
 @with_options(KeyLimits, "limit")
 def limit_key(name: NameArgument, *, options: dict[str, Any], json: JsonFlag = False) -> None:
     """Change the limits of a key, from the next request on."""
-    if not options:
-        raise InputError("give at least one limit, such as --jobs-per-day 100")
-    limits = _key_file().set_limits(name, KeyLimits(**options))
-    document = {"name": name, "limits": limits.model_dump(exclude_none=True)}
-    print_result(document, f"limits of {name}: {_key_limits(limits)}", json=json)
+    _report_limits(
+        "name", name, _key_file().set_limits(name, KeyLimits(**_given(options, "--jobs-per-day 100"))), json=json
+    )
 
 
 @keys_app.command("list", epilog="graspd keys list --json")
 def list_keys(json: JsonFlag = False) -> None:
     """List all keys, without their secrets."""
     found = _key_file().list()
-    document = {"keys": [key.model_dump(mode="json", exclude={"sha256"}) for key in found]}
     has_projects = any(key.project for key in found)
     names = ["name", "scope", *(["project"] if has_projects else []), "state", "created", "expires", "limits"]
     rows = []
@@ -78,9 +75,10 @@ def list_keys(json: JsonFlag = False) -> None:
         project = [key.project or "-"] if has_projects else []
         state = "live" if key.is_live else f"revoked {key.revoked[:16]}" if key.revoked else "expired"
         times = minute(key.created), minute(key.expires)
-        rows.append((key.name, key.scope, *project, state, *times, _key_limits(key.limits)))
+        rows.append((key.name, key.scope, *project, state, *times, _limits_text(key.limits)))
     empty = "no key; the service answers only this machine"
-    print_rows(document, names, rows, whole=("state", "created", "expires"), empty=empty, json=json)
+    told = [key.model_dump(mode="json", exclude={"sha256"}) for key in found]
+    print_rows("keys", told, names, rows, whole=("state", "created", "expires"), empty=empty, json=json)
 
 
 @keys_app.command("revoke", epilog="graspd keys revoke alice")
@@ -104,11 +102,6 @@ def _show_token(name: str, scope: Scope, token: str, *, json: bool) -> None:
         typer.echo("This is the only time the key is shown. Send it as `Authorization: Bearer ...`.", err=True)
 
 
-def _key_limits(limits: KeyLimits) -> str:
-    found = limits.model_dump(exclude_none=True)
-    return ", ".join(f"{value or 'no limit on'} {name.replace('_', ' ')}" for name, value in found.items()) or "default"
-
-
 def _key_file() -> KeyFile:
     return KeyFile(load_settings().resolved_keys_file)
 
@@ -129,9 +122,9 @@ def list_projects(json: JsonFlag = False) -> None:
     for name, limits in found.items():
         keys = live.get(name, [])
         projects.append({"project": name, "keys": keys, "limits": limits.model_dump(exclude_none=True)})
-        rows.append((name, ", ".join(keys) or "no valid key", _project_limits(limits)))
+        rows.append((name, ", ".join(keys) or "no valid key", _limits_text(limits)))
     empty = "no project yet; `graspd keys add NAME --project PROJECT` makes one"
-    print_rows({"projects": projects}, ("project", "keys", "limits"), rows, empty=empty, json=json)
+    print_rows("projects", projects, ("project", "keys", "limits"), rows, empty=empty, json=json)
 
 
 @projects_app.command("limit", epilog="graspd projects limit vision --gpu-seconds-per-day 86400")
@@ -143,66 +136,78 @@ def limit_project(
     json: JsonFlag = False,
 ) -> None:
     """Change the shared limits of a project's keys, from the next submission on."""
-    if not options:
-        raise InputError("give at least one limit, such as --grasps-per-day 1000000")
-    limits = _key_file().limit_project(name, ProjectLimits(**options))
-    document = {"project": name, "limits": limits.model_dump(exclude_none=True)}
-    print_result(document, f"limits of {name}: {_project_limits(limits)}", json=json)
+    _report_limits(
+        "project",
+        name,
+        _key_file().limit_project(name, ProjectLimits(**_given(options, "--grasps-per-day 1000000"))),
+        json=json,
+    )
 
 
-def _project_limits(limits: ProjectLimits) -> str:
-    found = {name: value for name, value in limits.model_dump().items() if value}
-    return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in found.items()) or "none"
+def _given(limits: dict[str, Any], example: str) -> dict[str, Any]:
+    if not limits:
+        raise InputError(f"give at least one limit, such as {example}")
+    return limits
 
 
-webhooks_app = CommandGroup(no_args_is_help=True, help="Notify URLs when jobs and datasets end.")
+def _report_limits(what: str, name: str, limits: KeyLimits | ProjectLimits, *, json: bool) -> None:
+    document = {what: name, "limits": limits.model_dump(exclude_none=True)}
+    print_result(document, f"limits of {name}: {_limits_text(limits)}", json=json)
+
+
+def _limits_text(limits: KeyLimits | ProjectLimits) -> str:
+    """Return limits in words: of a key those that differ from the settings, of a project those that hold."""
+    of_key = isinstance(limits, KeyLimits)
+    found = limits.model_dump(exclude_none=True)
+    texts = [
+        f"{number or 'no limit on'} {name.replace('_', ' ')}" for name, number in found.items() if of_key or number
+    ]
+    return ", ".join(texts) or ("default" if of_key else "none")
+
+
+webhooks_app = ClientGroup(no_args_is_help=True, help="Notify URLs when jobs and datasets end.")
 
 IdArgument = Annotated[str, typer.Argument(metavar="ID", help="Id of the webhook, from `graspd webhooks list`.")]
 
 
 @webhooks_app.command("add", epilog="graspd webhooks add https://ci.example.org/graspd --on succeeded,failed")
 def add_webhook(
+    client: Client,
     address: Annotated[str, typer.Argument(help="URL that receives the POST requests: https://host/path.")],
     on: Annotated[str, typer.Option(help="Final states, separated by commas.")] = "succeeded,failed,cancelled",
-    url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Notify a URL when jobs and datasets end. The secret that signs notifications is shown once."""
     states = [one.strip() for one in on.split(",") if one.strip()]
-    with open_client(url) as client:
-        made = client.send("POST", "/v1/webhooks", json={"url": address, "states": states}).json()
+    made = client.send("POST", "/v1/webhooks", json={"url": address, "states": states}).json()
     print_result(made, made["secret"], json=json)
     if not json:
         typer.echo(f"webhook {made['id']}. This is the only time its secret is shown.", err=True)
 
 
 @webhooks_app.command("list", epilog="graspd webhooks list")
-def list_webhooks(url: UrlOption = None, json: JsonFlag = False) -> None:
+def list_webhooks(client: Client, json: JsonFlag = False) -> None:
     """List webhooks that the key may change."""
-    with open_client(url) as client:
-        found = client.send("GET", "/v1/webhooks").json()
+    found = client.send("GET", "/v1/webhooks").json()
     rows = [(one["id"], one["url"], ", ".join(one["states"]), minute(one["created"])) for one in found]
     names, empty = ("id", "address", "on", "since"), "no webhook yet; `graspd webhooks add URL` makes one"
-    print_rows({"webhooks": found}, names, rows, whole=("id", "since"), empty=empty, json=json)
+    print_rows("webhooks", found, names, rows, whole=("id", "since"), empty=empty, json=json)
 
 
 @webhooks_app.command("log", epilog="graspd webhooks log 1a2b3c")
-def show_log(webhook: IdArgument, url: UrlOption = None, json: JsonFlag = False) -> None:
+def show_log(client: Client, webhook: IdArgument, json: JsonFlag = False) -> None:
     """List deliveries of a webhook, newest first."""
-    with open_client(url) as client:
-        found = client.send("GET", request_path("webhooks", webhook, "deliveries")).json()
+    found = client.send("GET", request_path("webhooks", webhook, "deliveries")).json()
     rows = []
     for one in found:
         what = f"{one['kind']} {one['subject'][:12] if one['kind'] == 'job' else one['subject']}"
         rows.append((what, one["ended"], one["state"], str(one["attempts"]), minute(one["tried"]), one["detail"]))
     names, whole = ("what", "ended", "delivery", "attempts", "last", ""), ("ended", "delivery", "last")
-    print_rows({"deliveries": found}, names, rows, whole=whole, empty="no delivery yet", json=json)
+    print_rows("deliveries", found, names, rows, whole=whole, empty="no delivery yet", json=json)
 
 
 @webhooks_app.command("delete", epilog="graspd webhooks delete 1a2b3c")
-def delete_webhook(webhook: IdArgument, yes: YesOption = False, url: UrlOption = None, json: JsonFlag = False) -> None:
+def delete_webhook(client: Client, webhook: IdArgument, yes: YesOption = False, json: JsonFlag = False) -> None:
     """Delete a webhook and its secret."""
-    with open_client(url) as client:
-        confirm(f"Delete the webhook {webhook} and its secret for good?", f"the webhook {webhook}", yes=yes)
-        client.delete(request_path("webhooks", webhook))
-    report_deletion("webhook", webhook, json=json)
+    question = f"Delete the webhook {webhook} and its secret for good?"
+    delete(client, "webhook", webhook, question, yes=yes, json=json)

@@ -14,7 +14,7 @@ import typer
 
 from graspd.api.uploads import name_of_upload
 from graspd.client.client import Client
-from graspd.client.reports import UrlOption, open_client, show_asset
+from graspd.client.reports import show_asset
 from graspd.service.cli import JsonFlag, print_json
 from graspd.service.command_options import with_options
 from graspd.service.index.views import AssetView
@@ -46,6 +46,7 @@ _SELF_TEST_S: Final = 900.0
 
 @with_options(HandCommandOptions, "asset")
 def add_hand(
+    client: Client,
     file: Annotated[Path, typer.Argument(help="URDF, xacro or MJCF file with its meshes, its folder, or a ZIP of it.")],
     name: NameOption = None,
     *,
@@ -55,16 +56,16 @@ def add_hand(
     self_test: Annotated[bool, typer.Option(help="Run the self-test: hold and lift simple shapes.")] = True,
     shared: SharedOption = False,
     wait: WaitOption = True,
-    url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Upload a hand, wait for its check, and report guesses and the self-test on simple shapes."""
     options = hand_options(**options) | provenance(licence, source)
-    _add(AssetKind.HAND, file, name, options, self_test=self_test, shared=shared, wait=wait, url=url, json=json)
+    _add(client, AssetKind.HAND, file, name, options, self_test=self_test, shared=shared, wait=wait, json=json)
 
 
 @with_options(ObjectSizeOptions, "asset")
 def add_object(
+    client: Client,
     file: Annotated[Path, typer.Argument(help="Mesh, URDF, SDF, MJCF, ZIP of one, or folder or ZIP of many objects.")],
     name: NameOption = None,
     *,
@@ -74,7 +75,6 @@ def add_object(
     split: Annotated[bool, typer.Option("--split", help="Also make the sets NAME-train and NAME-report.")] = False,
     shared: SharedOption = False,
     wait: WaitOption = True,
-    url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Upload an object or a set of objects, wait for the check, and report repairs."""
@@ -84,47 +84,54 @@ def add_object(
     options |= provenance(licence, source) | ({"scale_to": sizes[0]} if len(sizes) == 1 else {})
     if len(sizes) > 1:
         swept = scale_objects(find_set_objects(file) or single_object(file, name), sizes)
-        add = partial(add_set, swept, name=name or name_of_set(file), prefix=None, split=split)
+        add = partial(add_set, client, swept, name=name or name_of_set(file), prefix=None, split=split)
     elif files := find_set_objects(file):
-        add = partial(add_set, files, name=name or name_of_set(file), prefix=name, split=split)
+        add = partial(add_set, client, files, name=name or name_of_set(file), prefix=name, split=split)
     else:
-        add = partial(_add, AssetKind.OBJECT, file, name)
-    add(options=options, shared=shared, wait=wait, url=url, json=json)
+        add = partial(_add, client, AssetKind.OBJECT, file, name)
+    add(options=options, shared=shared, wait=wait, json=json)
 
 
 def add_network(
+    client: Client,
     file: Annotated[Path, typer.Argument(help="NPZ file of the schema graspd/proposals@1.")],
     name: NameOption = None,
     licence: LicenceOption = None,
     source: SourceOption = None,
     shared: SharedOption = False,
-    url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Upload a network that proposes grasps of a hand, as starts of jobs with `--method learned`."""
-    _add(AssetKind.NETWORK, file, name, provenance(licence, source), shared=shared, wait=False, url=url, json=json)
+    _add(client, AssetKind.NETWORK, file, name, provenance(licence, source), shared=shared, wait=False, json=json)
 
 
 def _add(
+    client: Client,
     kind: AssetKind,
     file: Path,
     name: str | None,
     options: dict[str, Any],
     *,
     self_test: bool = False,
-    shared: bool = False,
     wait: bool,
-    url: str | None,
     json: bool,
+    shared: bool,
 ) -> None:
-    with open_client(url) as client, upload_of(file) as (upload, main):
-        name, said = name or name_of_upload(upload.name), ({"file": main} if main else {}) | options
-        asset = client.upload(kind, upload, name=name, options=said, self_test=self_test, shared=shared)
-        if wait:
-            asset = client.wait_for_check(kind, asset.digest, timeout_s=_SELF_TEST_S if self_test else _CHECK_S)
+    asset = upload_file(client, kind, file, name, options, self_test=self_test, shared=shared)
+    if wait:
+        asset = client.wait_for_check(kind, asset.digest, timeout_s=_SELF_TEST_S if self_test else _CHECK_S)
     show_asset(asset.model_dump(mode="json"), json=json)
     if asset.verdict == "refuse":
         raise InputError(f"refused: {asset.message}")
+
+
+def upload_file(
+    client: Client, kind: AssetKind, path: Path, name: str | None, options: dict[str, Any], **extra: bool
+) -> AssetView:
+    """Upload a file with the files that it needs; the default of `name` is the file's name."""
+    with upload_of(path) as (upload, main):
+        said = ({"file": main} if main else {}) | options
+        return client.upload(kind, upload, name=name or name_of_upload(upload.name), options=said, **extra)
 
 
 @contextmanager
@@ -166,23 +173,9 @@ def name_of_set(path: Path) -> str:
     return name_of_upload(f"{place.name}.zip" if place.is_dir() else place.name)
 
 
-def add_set(
-    objects: Objects,
-    *,
-    name: str,
-    prefix: str | None,
-    options: dict[str, Any],
-    split: bool = False,
-    shared: bool = False,
-    wait: bool,
-    url: str | None,
-    json: bool,
-) -> None:
-    """Upload objects as a set and report it; raise InputError if objects were refused."""
-    with open_client(url) as client:
-        say = None if json else typer.echo
-        given: dict[str, Any] = {"prefix": prefix, "options": options, "split": split, "shared": shared, "wait": wait}
-        told = upload_set(client, objects, name, **given, say=say)
+def add_set(client: Client, objects: Objects, *, name: str, json: bool, **given: Any) -> None:
+    """Upload objects as `upload_set` does and report the set; raise InputError if objects were refused."""
+    told = upload_set(client, objects, name, **given, say=None if json else typer.echo)
     refused = [one["name"] for one in told if one["verdict"] == "refuse"]
     taken = len(told) - len(refused)
     if json:

@@ -20,7 +20,6 @@ from graspd.service.cli import write_output
 from graspd.service.index.views import AssetView, CellView, DatasetView, ObjectSetView, Page, SnapshotView
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError, without_secrets
-from graspd.service.model.records import Snapshot
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.spec import DatasetRequest, Estimate, Matrix
 
@@ -62,33 +61,21 @@ class Client(AbstractContextManager["Client"]):
 
     def submit(self, request: JobRequest) -> JobDetail:
         """Submit a job; an identical request returns the same job."""
-        return self._request_model(JobDetail, "POST", "/v1/jobs", json=request.model_dump(mode="json"))
+        return self.request(JobDetail, "POST", "/v1/jobs", json=request.model_dump(mode="json"))
 
     def job(self, job_id: str) -> JobDetail:
-        return self._request_model(JobDetail, "GET", request_path("jobs", job_id))
+        return self.request(JobDetail, "GET", request_path("jobs", job_id))
 
     def jobs(self, *, state: State | None = None, prefix: str = "", limit: int = 50) -> Page[Job]:
         """Return the newest jobs whose ids begin with `prefix`, at most `limit`."""
-        return self._request_model(
-            Page[Job], "GET", "/v1/jobs", params={"state": state, "prefix": prefix, "limit": limit}
-        )
-
-    def cancel(self, job_id: str) -> JobDetail:
-        return self._request_model(JobDetail, "POST", request_path("jobs", job_id, "cancel"))
-
-    def delete(self, path: str, **params: Any) -> None:
-        """Delete the resource at an address: `/v1/jobs/ID`, `/v1/objects/NAME`."""
-        self.send("DELETE", path, params=params)
-
-    def retry(self, job_id: str) -> JobDetail:
-        return self._request_model(JobDetail, "POST", request_path("jobs", job_id, "retry"))
+        return self.request(Page[Job], "GET", "/v1/jobs", params={"state": state, "prefix": prefix, "limit": limit})
 
     def assets(self, kind: AssetKind, *, refused: bool = False) -> Iterator[AssetView]:
         """Yield all hands, objects or networks; refused ones only on request."""
         return self._pages(AssetView, f"/v1/{kind.value}s", refused=refused)
 
     def asset(self, kind: AssetKind, name: str) -> AssetView:
-        return self._request_model(AssetView, "GET", request_path(f"{kind.value}s", name))
+        return self.request(AssetView, "GET", request_path(f"{kind.value}s", name))
 
     def upload(
         self,
@@ -106,7 +93,7 @@ class Client(AbstractContextManager["Client"]):
         try:
             with path.open("rb") as file:
                 sent = {"file": (path.name, file)}
-                return self._request_model(AssetView, "POST", f"/v1/{kind.value}s", files=sent, data=fields)
+                return self.request(AssetView, "POST", f"/v1/{kind.value}s", files=sent, data=fields)
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}") from None
 
@@ -157,33 +144,24 @@ class Client(AbstractContextManager["Client"]):
         return self.job(job_id)
 
     def create_dataset(self, request: DatasetRequest) -> DatasetView:
-        return self._request_model(DatasetView, "POST", "/v1/datasets", json=_matrix_body(request))
+        return self.request(DatasetView, "POST", "/v1/datasets", json=_matrix_body(request))
 
     def estimate(self, matrix: Matrix) -> Estimate:
         body = {name: value for name, value in _matrix_body(matrix).items() if name in Matrix.model_fields}
-        return self._request_model(Estimate, "POST", "/v1/datasets/estimate", json=body)
+        return self.request(Estimate, "POST", "/v1/datasets/estimate", json=body)
 
     def datasets(self, *, limit: int = 50) -> Page[DatasetView]:
-        return self._request_model(Page[DatasetView], "GET", "/v1/datasets", params={"limit": limit})
+        return self.request(Page[DatasetView], "GET", "/v1/datasets", params={"limit": limit})
 
     def dataset(self, name: str) -> DatasetView:
-        return self._request_model(DatasetView, "GET", request_path("datasets", name))
+        return self.request(DatasetView, "GET", request_path("datasets", name))
 
     def cells(self, name: str, *, state: State | None = None) -> Iterator[CellView]:
         """Yield all cells of a dataset, or those in a state."""
         return self._pages(CellView, request_path("datasets", name, "cells"), state=state)
 
-    def cancel_dataset(self, name: str) -> DatasetView:
-        return self._request_model(DatasetView, "POST", request_path("datasets", name, "cancel"))
-
-    def retry_dataset(self, name: str) -> DatasetView:
-        return self._request_model(DatasetView, "POST", request_path("datasets", name, "retry"))
-
     def take_snapshot(self, name: str) -> SnapshotView:
-        return self._request_model(SnapshotView, "POST", request_path("datasets", name, "snapshots"))
-
-    def snapshot(self, name: str, digest: str) -> Snapshot:
-        return self._request_model(Snapshot, "GET", request_path("datasets", name, "snapshots", digest))
+        return self.request(SnapshotView, "POST", request_path("datasets", name, "snapshots"))
 
     def watch_dataset(self, name: str) -> Iterator[DatasetView]:
         """Yield a dataset every second until it ends."""
@@ -194,7 +172,7 @@ class Client(AbstractContextManager["Client"]):
 
     def add_object_set(self, name: str, objects: Iterable[str]) -> ObjectSetView:
         body = {"name": name, "objects": list(objects)}
-        return self._request_model(ObjectSetView, "POST", "/v1/object-sets", json=body)
+        return self.request(ObjectSetView, "POST", "/v1/object-sets", json=body)
 
     def object_sets(self) -> list[ObjectSetView]:
         return TypeAdapter(list[ObjectSetView]).validate_json(self.send("GET", "/v1/object-sets").content)
@@ -202,13 +180,14 @@ class Client(AbstractContextManager["Client"]):
     def _pages(self, kind: type[View], path: str, **params: Any) -> Iterator[View]:
         params |= {"limit": _PAGE, "cursor": None}
         while True:
-            page: Page[Any] = self._request_model(Page[kind], "GET", path, params=params)  # type: ignore[valid-type]
+            page: Page[Any] = self.request(Page[kind], "GET", path, params=params)  # type: ignore[valid-type]
             yield from page.items
             params["cursor"] = page.next
             if page.next is None:
                 return
 
-    def _request_model(self, kind: type[View], method: str, path: str, **options: Any) -> View:
+    def request(self, kind: type[View], method: str, path: str, **options: Any) -> View:
+        """Send a request and return the response as a model."""
         return kind.model_validate_json(self.send(method, path, **options).content)
 
     def _is_reachable_again(self) -> bool:

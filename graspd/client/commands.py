@@ -10,11 +10,12 @@ from typing import Annotated, Any
 import typer
 
 from graspd.api.formatting import count, minute, percent, size
-from graspd.api.uploads import MAIN_SUFFIXES, name_of_upload
+from graspd.api.models import JobDetail
+from graspd.api.uploads import MAIN_SUFFIXES
 from graspd.client import access_commands, reports, tag_commands
-from graspd.client.add_commands import add_hand, add_network, add_object, upload_of
+from graspd.client.add_commands import add_hand, add_network, add_object, upload_file
 from graspd.client.client import Client, request_path
-from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
+from graspd.service.cli import JsonFlag, plain_console, print_json
 from graspd.service.command_options import parse_pairs, validate_options, with_options
 from graspd.service.model.domain import NETWORK_METHODS, JobOptions, JobRequest
 from graspd.service.model.errors import InputError
@@ -22,7 +23,7 @@ from graspd.service.model.scene_spec import parse_scene_option
 from graspd.service.model.states import AssetKind, State
 from graspd.service.store.asset_summary import hand_line, self_test_line
 
-app = CommandGroup(no_args_is_help=True)
+app = reports.ClientGroup(no_args_is_help=True)
 
 JobArgument = Annotated[str, typer.Argument(help="Job id, or a prefix of it.")]
 WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until the job ends.")]
@@ -32,44 +33,41 @@ AssetArgument = Annotated[str, typer.Argument(help="Name or digest of the asset.
 @app.command(epilog="graspd submit --hand allegro --object mug.stl --grasps 320 --scenes 2 --views 3 --wait")
 @with_options(JobOptions, "job")
 def submit(
+    client: Client,
     hand: Annotated[str, typer.Option(help="Name of a hand, or a URDF or ZIP to upload.")],
     object: Annotated[str, typer.Option(help="Name of an object, or a mesh file to upload.")],
     options: dict[str, Any],
     wait: WaitOption = False,
-    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Submit a job: one hand on one object."""
-    with reports.open_client(url) as client:
-        object_name = partial(_asset_name, client, AssetKind.OBJECT)
-        own = parse_pairs(options.get("options", ()))
-        if options.get("method") in NETWORK_METHODS and "network" in own:
-            own["network"] = _asset_name(client, AssetKind.NETWORK, str(own["network"]))
-        options |= {
-            "hand": _asset_name(client, AssetKind.HAND, hand),
-            "object": object_name(object),
-            "options": own,
-            "scene": parse_scene_option(options.get("scene", "free"), named=object_name),
-            "neighbours": [object_name(one) for one in options.get("neighbours", ())],
-        }
-        request = validate_options(JobRequest, options)
-        job = client.submit(request)
-        if wait:
-            job = reports.watch(client, job.id)
-        reports.show_job(job, json=json, url=client.url)
+    object_name = partial(_asset_name, client, AssetKind.OBJECT)
+    own = parse_pairs(options.get("options", ()))
+    if options.get("method") in NETWORK_METHODS and "network" in own:
+        own["network"] = _asset_name(client, AssetKind.NETWORK, str(own["network"]))
+    options |= {
+        "hand": _asset_name(client, AssetKind.HAND, hand),
+        "object": object_name(object),
+        "options": own,
+        "scene": parse_scene_option(options.get("scene", "free"), named=object_name),
+        "neighbours": [object_name(one) for one in options.get("neighbours", ())],
+    }
+    request = validate_options(JobRequest, options)
+    job = client.submit(request)
+    if wait:
+        job = reports.watch(client, job.id)
+    reports.show_job(job, json=json, url=client.url)
 
 
 @app.command(epilog="graspd jobs --state running")
 def jobs(
+    client: Client,
     state: Annotated[State | None, typer.Option(help="Only jobs in this state.")] = None,
     limit: Annotated[int, typer.Option(min=1, max=200, help="Maximum number of jobs.")] = 20,
-    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """List jobs, newest first."""
-    with reports.open_client(url) as client:
-        page = client.jobs(state=state, limit=limit)
-    document = {"jobs": [job.model_dump(mode="json") for job in page.items], "next": page.next}
+    page = client.jobs(state=state, limit=limit)
     rows = []
     for job in page.items:
         made = job.valid if job.standing == "valid" else job.grasps
@@ -78,63 +76,54 @@ def jobs(
         rows.append((job.id[:12], job.state, job.hand, job.object, *last))
     names = ("job", "state", "hand", "object", "progress", "grasps", "created")
     empty = "no job yet; `graspd submit --hand allegro --object mug` makes one"
-    reports.print_rows(document, names, rows, whole=("job", "state", "created"), empty=empty, json=json)
+    whole = ("job", "state", "created")
+    reports.print_rows("jobs", page.items, names, rows, whole=whole, empty=empty, json=json, next=page.next)
 
 
 @app.command(epilog="graspd status 3f2a --json")
-def status(job_id: JobArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
+def status(client: Client, job_id: JobArgument, json: JsonFlag = False) -> None:
     """Show stages, progress and quality of a job."""
-    with reports.open_client(url) as client:
-        reports.show_job(client.job(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
+    reports.show_job(client.job(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
 
 
 @app.command(epilog="graspd cancel 3f2a")
-def cancel(job_id: JobArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
+def cancel(client: Client, job_id: JobArgument, json: JsonFlag = False) -> None:
     """Cancel a job; its results remain."""
-    with reports.open_client(url) as client:
-        reports.show_job(client.cancel(_full_id(client, job_id)), json=json, url=client.url, must_succeed=False)
+    reports.show_job(_change_job(client, job_id, "cancel"), json=json, url=client.url, must_succeed=False)
 
 
 @app.command(epilog="graspd delete 3f2a")
-def delete(
-    job_id: JobArgument, yes: reports.YesOption = False, url: reports.UrlOption = None, json: JsonFlag = False
-) -> None:
+def delete(client: Client, job_id: JobArgument, yes: reports.YesOption = False, json: JsonFlag = False) -> None:
     """Delete an ended job. Shards that no other job uses are deleted after a grace time."""
-    with reports.open_client(url) as client:
-        job = client.job(_full_id(client, job_id))
-        asked = f"Delete job {job.id[:12]}, {job.hand} on {job.object}, with its {count(job.grasps)} grasps?"
-        reports.confirm(asked, f"job {job.id[:12]}", yes=yes)
-        client.delete(request_path("jobs", job.id))
-    reports.report_deletion("job", job.id, json=json, undo=f"graspd restore {job.id[:12]}")
+    job = client.job(_full_id(client, job_id))
+    asked = f"Delete job {job.id[:12]}, {job.hand} on {job.object}, with its {count(job.grasps)} grasps?"
+    reports.delete(client, "job", job.id, asked, yes=yes, json=json, undo=f"graspd restore {job.id[:12]}")
 
 
 @app.command("restore", epilog="graspd restore 3f2a")
 def restore_job(
+    client: Client,
     job_id: Annotated[str, typer.Argument(help="Id of a deleted job, or a prefix of it.")],
-    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Restore a deleted job, within the grace time."""
-    with reports.open_client(url) as client:
-        gone = [one["id"] for one in client.send("GET", "/v1/deletions").json() if one["what"] == "job"]
-    reports.restore(url, "job", _unique_id(gone, job_id), json=json)
+    gone = [one["id"] for one in client.send("GET", "/v1/deletions").json() if one["what"] == "job"]
+    reports.restore(client, "job", _unique_id(gone, job_id), json=json)
 
 
 @app.command(epilog="graspd retry 3f2a --wait")
-def retry(job_id: JobArgument, wait: WaitOption = False, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
+def retry(client: Client, job_id: JobArgument, wait: WaitOption = False, json: JsonFlag = False) -> None:
     """Run failed and cancelled tasks of a job again; existing results are reused."""
-    with reports.open_client(url) as client:
-        job = client.retry(_full_id(client, job_id))
-        if wait:
-            job = reports.watch(client, job.id)
-        reports.show_job(job, json=json, url=client.url)
+    job = _change_job(client, job_id, "retry")
+    if wait:
+        job = reports.watch(client, job.id)
+    reports.show_job(job, json=json, url=client.url)
 
 
 @app.command(epilog="graspd logs 3f2a")
-def logs(job_id: JobArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
+def logs(client: Client, job_id: JobArgument, json: JsonFlag = False) -> None:
     """Show failed attempts of a job with their reasons."""
-    with reports.open_client(url) as client:
-        job = client.job(_full_id(client, job_id))
+    job = client.job(_full_id(client, job_id))
     if json:
         print_json({"job": job.id, "attempts": [attempt.model_dump(mode="json") for attempt in job.attempts]})
         return
@@ -151,17 +140,15 @@ def logs(job_id: JobArgument, url: reports.UrlOption = None, json: JsonFlag = Fa
 def asset_commands(kind: AssetKind) -> typer.Typer:
     """Create `graspd hands ...`, `graspd objects ...` or `graspd networks ...`."""
     verbs = "Add, list, show and delete" if kind is AssetKind.NETWORK else "Check, add, list, show and delete"
-    group = CommandGroup(no_args_is_help=True, help=f"{verbs} {kind.value}s.")
+    group = reports.ClientGroup(no_args_is_help=True, help=f"{verbs} {kind.value}s.")
 
     @group.command("list", help=f"List {kind.value}s, by default without refused ones.")
     def list_assets(
+        client: Client,
         refused: Annotated[bool, typer.Option("--refused", help="Include refused ones.")] = False,
-        url: reports.UrlOption = None,
         json: JsonFlag = False,
     ) -> None:
-        with reports.open_client(url) as client:
-            assets = list(client.assets(kind, refused=refused))
-        document = {f"{kind.value}s": [asset.model_dump(mode="json") for asset in assets]}
+        assets = list(client.assets(kind, refused=refused))
         # All networks have the same file name, so their hand is shown instead.
         is_network, rows = kind is AssetKind.NETWORK, []
         for asset in assets:
@@ -171,17 +158,11 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
             second = hand_line(asset.facts) if is_network else asset.filename
             rows.append((asset.name, second, size(asset.size_bytes), origin, asset.digest[:12]))
         names = ("name", "hand" if is_network else "file", "size", "check", "digest")
-        reports.print_rows(document, names, rows, whole=("size", "digest"), json=json)
+        reports.print_rows(f"{kind.value}s", assets, names, rows, whole=("size", "digest"), json=json)
 
     @group.command("show", help=f"Show a {kind.value} with the findings of its check.")
-    def show(
-        name: Annotated[str, typer.Argument(help="Name of the asset.")],
-        url: reports.UrlOption = None,
-        json: JsonFlag = False,
-    ) -> None:
-        with reports.open_client(url) as client:
-            asset = client.asset(kind, name)
-        reports.show_asset(asset.model_dump(mode="json"), json=json)
+    def show(client: Client, name: AssetArgument, json: JsonFlag = False) -> None:
+        reports.show_asset(client.asset(kind, name).model_dump(mode="json"), json=json)
 
     @group.command(
         "delete",
@@ -189,21 +170,19 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
         epilog=f"graspd {kind.value}s delete my_{kind.value}",
     )
     def delete_asset(
-        name: AssetArgument, yes: reports.YesOption = False, url: reports.UrlOption = None, json: JsonFlag = False
+        client: Client, name: AssetArgument, yes: reports.YesOption = False, json: JsonFlag = False
     ) -> None:
-        with reports.open_client(url) as client:
-            client.asset(kind, name)
-            reports.confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
-            client.delete(request_path(f"{kind.value}s", name))
-        reports.report_deletion(kind.value, name, json=json, undo=f"graspd {kind.value}s restore {name}")
+        client.asset(kind, name)
+        question, undo = f"Delete the {kind.value} {name}?", f"graspd {kind.value}s restore {name}"
+        reports.delete(client, kind.value, name, question, yes=yes, json=json, undo=undo)
 
     @group.command(
         "restore",
         help=f"Restore a deleted {kind.value} within the grace time.",
         epilog=f"graspd {kind.value}s restore my_{kind.value}",
     )
-    def restore_asset(name: AssetArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
-        reports.restore(url, kind.value, name, json=json)
+    def restore_asset(client: Client, name: AssetArgument, json: JsonFlag = False) -> None:
+        reports.restore(client, kind.value, name, json=json)
 
     return group
 
@@ -215,15 +194,13 @@ networks_app.command("add", epilog="graspd networks add barrett.npz")(add_networ
 
 
 @objects_app.command("sets", epilog="graspd objects sets")
-def sets(url: reports.UrlOption = None, json: JsonFlag = False) -> None:
+def sets(client: Client, json: JsonFlag = False) -> None:
     """List sets of objects; `graspd objects add FOLDER` makes one."""
-    with reports.open_client(url) as client:
-        found = client.object_sets()
-    document = {"sets": [one.model_dump(mode="json") for one in found]}
+    found = client.object_sets()
     shown = [", ".join(one.objects[:5]) + ", ..." * (len(one.objects) > 5) for one in found]
     rows = [(one.name, count(len(one.objects)), text) for one, text in zip(found, shown, strict=True)]
     empty = "no set yet; `graspd objects add FOLDER` makes one"
-    reports.print_rows(document, ("set", "objects", ""), rows, empty=empty, json=json)
+    reports.print_rows("sets", found, ("set", "objects", ""), rows, empty=empty, json=json)
 
 
 app.add_typer(hands_app, name="hands")
@@ -242,11 +219,14 @@ def _asset_name(client: Client, kind: AssetKind, value: str) -> str:
         return value
     if not path.is_file():
         raise InputError(f"there is no file {value}; give a path that exists, or the name of a known {kind.value}")
-    with upload_of(path) as (upload, main):
-        asset = client.upload(kind, upload, name=name_of_upload(upload.name), options={"file": main} if main else {})
+    asset = upload_file(client, kind, path, None, {})
     if not asset.builtin and (asset := client.wait_for_check(kind, asset.digest)).verdict == "refuse":
         raise InputError(f"refused: {asset.message}")
     return asset.name
+
+
+def _change_job(client: Client, job_id: str, verb: str) -> JobDetail:
+    return client.request(JobDetail, "POST", request_path("jobs", _full_id(client, job_id), verb))
 
 
 def _full_id(client: Client, prefix: str) -> str:

@@ -26,6 +26,7 @@ from graspd.service.model.base import Name, error_text
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError, did_you_mean
 from graspd.service.model.options import validate
+from graspd.service.model.records import Snapshot
 from graspd.service.model.scene_spec import check_object_name, parse_scene_option
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.export import export_shards
@@ -122,7 +123,7 @@ def _objects(spec: Path | None, said: Any) -> str:
 
 
 app = CommandGroup(no_args_is_help=True)
-group = CommandGroup(no_args_is_help=True, help="Datasets of hands x objects: cost, status, snapshots, files.")
+group = reports.ClientGroup(no_args_is_help=True, help="Datasets of hands x objects: cost, status, snapshots, files.")
 app.add_typer(group, name="datasets")
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the dataset.")]
@@ -134,6 +135,7 @@ WaitOption = Annotated[bool, typer.Option("--wait", help="Show progress until th
 @group.command(epilog="graspd datasets create kitchen --hands allegro,shadow --objects ./ycb --grasps 1000")
 @with_options(JobOptions, "job")
 def create(
+    client: Client,
     name: Annotated[str | None, typer.Argument(help="Name of the dataset; default: the name in the spec.")] = None,
     hands: HandsOption = None,
     objects: ObjectsOption = None,
@@ -141,7 +143,6 @@ def create(
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Start without confirmation.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the estimated cost and exit.")] = False,
     wait: WaitOption = False,
-    url: reports.UrlOption = None,
     json: JsonFlag = False,
     *,
     options: dict[str, Any],
@@ -151,28 +152,30 @@ def create(
     asked = dataset_plan(spec, name=name, hands=hands, objects=objects, options=options)
     if not asked.name:
         raise InputError("give a name: graspd datasets create NAME, or name in the file of --spec")
-    with reports.open_client(url) as client:
-        files, matrix = _matrix(client, asked)
-        request = validate_options(DatasetRequest, {"name": asked.name, **matrix})
-        found = _estimate(client, matrix, files)
-        reports.print_estimate(found, console)
-        if dry_run:
-            _emit(json, estimate=found)
-            return
-        if not yes and not sys.stdin.isatty():
-            raise InputError("give --yes to start it, or --dry-run for the cost alone")
-        if not yes and not typer.confirm("Start it?"):
-            raise InputError("nothing was started")
-        refused: list[str] = []
-        if files is not None:
-            refused = _upload(client, files, name_of_set(Path(asked.objects)), console)
-            matrix = asked.matrix_per_cell(matrix, len(files) - len(refused))
-            request = validate_options(DatasetRequest, {"name": asked.name, **matrix, "objects": []})
-        dataset = client.create_dataset(request)
-        if wait:
-            dataset = reports.watch_dataset(client, asked.name, plain_console(stderr=True))
-    _emit(json, estimate=found, dataset=dataset, refused=refused)
-    if not json:
+    files, matrix = _matrix(client, asked)
+    request = validate_options(DatasetRequest, {"name": asked.name, **matrix})
+    found = _estimate(client, matrix, files)
+    shown = found.model_dump(mode="json")
+    reports.print_estimate(found, console)
+    if dry_run:
+        if json:
+            print_json({"estimate": shown})
+        return
+    if not yes and not sys.stdin.isatty():
+        raise InputError("give --yes to start it, or --dry-run for the cost alone")
+    if not yes and not typer.confirm("Start it?"):
+        raise InputError("nothing was started")
+    refused: list[str] = []
+    if files is not None:
+        refused = _upload(client, files, name_of_set(Path(asked.objects)), console)
+        matrix = asked.matrix_per_cell(matrix, len(files) - len(refused))
+        request = validate_options(DatasetRequest, {"name": asked.name, **matrix, "objects": []})
+    dataset = client.create_dataset(request)
+    if wait:
+        dataset = reports.watch_dataset(client, asked.name, plain_console(stderr=True))
+    if json:
+        print_json({"estimate": shown, "dataset": dataset.model_dump(mode="json"), "refused": refused})
+    else:
         if refused:
             console.print(f"refused, so not in the dataset: {', '.join(refused)}", soft_wrap=True)
         reports.print_dataset(dataset, console)
@@ -183,19 +186,18 @@ def create(
 @group.command(epilog="graspd datasets estimate --hands allegro --objects mug --grasps 1000000 --scenes 2 --views 3")
 @with_options(JobOptions, "job")
 def estimate(
+    client: Client,
     hands: HandsOption = None,
     objects: ObjectsOption = None,
     spec: SpecOption = None,
-    url: reports.UrlOption = None,
     json: JsonFlag = False,
     *,
     options: dict[str, Any],
 ) -> None:
     """Estimate the cost of a dataset: storage, and time and traffic for 1, 8 and 64 workers."""
     asked = dataset_plan(spec, name=None, hands=hands, objects=objects, options=options)
-    with reports.open_client(url) as client:
-        files, matrix = _matrix(client, asked)
-        found = _estimate(client, matrix, files)
+    files, matrix = _matrix(client, asked)
+    found = _estimate(client, matrix, files)
     if json:
         print_json(found)
     else:
@@ -204,14 +206,12 @@ def estimate(
 
 @group.command("list", epilog="graspd datasets list")
 def list_datasets(
+    client: Client,
     limit: Annotated[int, typer.Option(min=1, max=200, help="Maximum number of datasets.")] = 20,
-    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """List datasets, newest first."""
-    with reports.open_client(url) as client:
-        page = client.datasets(limit=limit)
-    document = {"datasets": [dataset.model_dump(mode="json") for dataset in page.items], "next": page.next}
+    page = client.datasets(limit=limit)
     rows = []
     for one in page.items:
         made = f"{count(one.counted_grasps)} {one.options.displayed_status} of {count(one.asked)}"
@@ -219,19 +219,19 @@ def list_datasets(
         rows.append((one.name, one.state, count(one.cells), *last))
     names = ("dataset", "state", "cells", "progress", "grasps", "size", "created")
     empty = "no dataset yet; `graspd datasets create NAME --hands allegro --objects mug,bottle` makes one"
-    reports.print_rows(document, names, rows, whole=("state", "size", "created"), empty=empty, json=json)
+    whole = ("state", "size", "created")
+    reports.print_rows("datasets", page.items, names, rows, whole=whole, empty=empty, json=json, next=page.next)
 
 
 @group.command(epilog="graspd datasets status kitchen --state failed")
 def status(
+    client: Client,
     name: NameArgument,
     state: Annotated[State | None, typer.Option(help="Only cells in this state.")] = None,
-    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Show the matrix: state, yield and failures of each hand and object."""
-    with reports.open_client(url) as client:
-        dataset, cells = client.dataset(name), list(client.cells(name, state=state))
+    dataset, cells = client.dataset(name), list(client.cells(name, state=state))
     if json:
         print_json({**dataset.model_dump(mode="json"), "matrix": [cell.model_dump(mode="json") for cell in cells]})
         return
@@ -240,52 +240,47 @@ def status(
 
 
 @group.command(epilog="graspd datasets cancel kitchen")
-def cancel(name: NameArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
+def cancel(client: Client, name: NameArgument, json: JsonFlag = False) -> None:
     """Cancel a dataset; its results remain."""
-    with reports.open_client(url) as client:
-        _show(client.cancel_dataset(name), json=json)
+    _show(client.request(DatasetView, "POST", request_path("datasets", name, "cancel")), json=json)
 
 
 @group.command(epilog="graspd datasets delete kitchen")
 def delete(
+    client: Client,
     name: NameArgument,
     yes: reports.YesOption = False,
     with_snapshots: Annotated[bool, typer.Option("--with-snapshots", help="Also delete its snapshots.")] = False,
-    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Delete an ended dataset, and the jobs that belong to it alone."""
-    with reports.open_client(url) as client:
-        found = client.dataset(name)
-        goes = f"{count(found.cells)} cell{'s' * (found.cells != 1)}, {count(found.grasps)} grasps"
-        goes += f" ({size(found.size_bytes)})" + ", its snapshots" * with_snapshots
-        reports.confirm(f"Delete dataset {name} with {goes}?", f"dataset {name}", yes=yes)
-        client.delete(request_path("datasets", name), with_snapshots=with_snapshots)
-    reports.report_deletion("dataset", name, json=json, undo=f"graspd datasets restore {name}")
+    found = client.dataset(name)
+    goes = f"{count(found.cells)} cell{'s' * (found.cells != 1)}, {count(found.grasps)} grasps"
+    goes += f" ({size(found.size_bytes)})" + ", its snapshots" * with_snapshots
+    question, undo = f"Delete dataset {name} with {goes}?", f"graspd datasets restore {name}"
+    reports.delete(client, "dataset", name, question, yes=yes, json=json, undo=undo, with_snapshots=with_snapshots)
 
 
 @group.command("restore", epilog="graspd datasets restore kitchen")
-def restore_dataset(name: NameArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
+def restore_dataset(client: Client, name: NameArgument, json: JsonFlag = False) -> None:
     """Restore a deleted dataset with its jobs and snapshots, within the grace time."""
-    reports.restore(url, "dataset", name, json=json)
+    reports.restore(client, "dataset", name, json=json)
 
 
 @group.command(epilog="graspd datasets retry kitchen --wait")
-def retry(name: NameArgument, wait: WaitOption = False, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
+def retry(client: Client, name: NameArgument, wait: WaitOption = False, json: JsonFlag = False) -> None:
     """Restart failed and cancelled jobs; existing results are reused."""
-    with reports.open_client(url) as client:
-        dataset = client.retry_dataset(name)
-        if wait:
-            dataset = reports.watch_dataset(client, name, plain_console(stderr=True))
+    dataset = client.request(DatasetView, "POST", request_path("datasets", name, "retry"))
+    if wait:
+        dataset = reports.watch_dataset(client, name, plain_console(stderr=True))
     _show(dataset, json=json)
     _check_success(dataset, asked=wait)
 
 
 @group.command(epilog="graspd datasets snapshot kitchen")
-def snapshot(name: NameArgument, url: reports.UrlOption = None, json: JsonFlag = False) -> None:
+def snapshot(client: Client, name: NameArgument, json: JsonFlag = False) -> None:
     """Record the present shards of a dataset as an immutable list."""
-    with reports.open_client(url) as client:
-        taken = client.take_snapshot(name)
+    taken = client.take_snapshot(name)
     whole = "complete" if taken.complete else "the dataset is not complete"
     grasps = f"{count(taken.grasps)} grasps of which {count(taken.valid)} are valid"
     line = f"{taken.digest}  {count(taken.shards)} shards, {grasps}, {size(taken.size_bytes)}; {whole}"
@@ -294,26 +289,26 @@ def snapshot(name: NameArgument, url: reports.UrlOption = None, json: JsonFlag =
 
 @group.command(epilog="graspd datasets export kitchen -o kitchen-v1 --snapshot 3f2a...")
 def export(
+    client: Client,
     name: NameArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; an interrupted export is continued.")],
     snapshot: Annotated[str | None, typer.Option(help="Digest of a snapshot; default: all present shards.")] = None,
-    url: reports.UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Write a snapshot's files into a folder; each is verified against its checksum."""
     label, counts = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[files]}")
     columns = (label, BarColumn(), counts, DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
-    with reports.open_client(url) as client:
-        taken = client.snapshot(name, snapshot or client.take_snapshot(name).digest)
-        console = plain_console(stderr=True)
-        with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-            bar = progress.add_task(name, total=taken.size_bytes, files="")
-            fetched = export_shards(
-                taken,
-                out,
-                lambda shard: client.fetch(request_path("shards", shard.id, "file")),
-                lambda done, files, fetched: progress.update(bar, completed=fetched, files=f"{done}/{files}"),
-            )
+    digest = snapshot or client.take_snapshot(name).digest
+    taken = client.request(Snapshot, "GET", request_path("datasets", name, "snapshots", digest))
+    console = plain_console(stderr=True)
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        bar = progress.add_task(name, total=taken.size_bytes, files="")
+        fetched = export_shards(
+            taken,
+            out,
+            lambda shard: client.fetch(request_path("shards", shard.id, "file")),
+            lambda done, files, fetched: progress.update(bar, completed=fetched, files=f"{done}/{files}"),
+        )
     told = {"dataset": name, "snapshot": taken.digest, "out": str(out), "files": len(taken.shards), "fetched": fetched}
     line = f"{out}: {count(len(taken.shards))} files, {size(taken.size_bytes)}, snapshot {taken.digest}"
     print_result({**told, "bytes": taken.size_bytes, "complete": taken.complete}, line, json=json)
@@ -359,11 +354,6 @@ def _upload(client: Client, files: Objects, set_name: str, console: Console) -> 
     if len(refused) == len(told):
         raise InputError(f"none of the {len(told)} objects can be used; reasons are above")
     return refused
-
-
-def _emit(json: bool, **parts: Estimate | DatasetView | list[str]) -> None:
-    if json:
-        print_json({k: part if isinstance(part, list) else part.model_dump(mode="json") for k, part in parts.items()})
 
 
 def _show(dataset: DatasetView, *, json: bool) -> None:

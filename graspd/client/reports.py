@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import sys
 import time
-from collections.abc import Collection, Sequence
-from typing import Annotated, Any, Final, Self
+from collections.abc import Callable, Collection, Sequence
+from typing import Annotated, Any, Final
 
 import typer
+from pydantic import BaseModel
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from graspd.api.formatting import count, duration, metric, percent, size, valid_yield, worker_time
 from graspd.api.models import Job, JobDetail, StageStatus
 from graspd.client.client import Client, request_path
-from graspd.service.cli import load_settings, plain_console, plain_table, print_json, print_result
+from graspd.service.cli import CommandGroup, load_settings, plain_console, plain_table, print_json, print_result
+from graspd.service.command_options import set_parameters
 from graspd.service.index.views import CellView, DatasetView, Validated
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError
@@ -37,43 +41,66 @@ def open_client(url: str | None, *, key: str | None = None) -> Client:
     return Client(url or settings.api_url, key=key)
 
 
+class ClientGroup(CommandGroup):
+    """Group of commands; their parameter `client` becomes the option `--url` before the last parameter."""
+
+    def command(self, *names: Any, **options: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:  # type: ignore[override]
+        add = super().command(*names, **options)
+        return lambda command: add(
+            _with_client(command) if "client" in inspect.signature(command).parameters else command
+        )
+
+
+def _with_client(command: Callable[..., None]) -> Callable[..., None]:
+    @functools.wraps(command)
+    def wrapper(url: str | None, **given: Any) -> None:
+        with open_client(url) as client:
+            command(client=client, **given)
+
+    own = [one for one in inspect.signature(command, eval_str=True).parameters.values() if one.name != "client"]
+    option = inspect.Parameter("url", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=UrlOption)
+    return set_parameters(wrapper, [*own[:-1], option, own[-1]])
+
+
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Delete without confirmation.")]
 
 
-def confirm(question: str, what: str, *, yes: bool) -> None:
-    """Ask before a deletion; raise InputError if the answer is no, or without a terminal."""
-    if yes:
-        return
-    if not sys.stdin.isatty():
-        raise InputError(f"{what} is not deleted: there is no terminal for the confirmation; --yes deletes without it")
-    if not typer.confirm(question):
+def delete(
+    client: Client, what: str, name: str, question: str, *, yes: bool, json: bool, undo: str = "", **params: Any
+) -> None:
+    """Delete a resource after a confirmation; InputError if the answer is no, or without a terminal."""
+    if not yes and not sys.stdin.isatty():
+        raise InputError(
+            f"{what} {name} is not deleted: there is no terminal for the confirmation; --yes deletes without it"
+        )
+    if not yes and not typer.confirm(question):
         raise InputError("nothing was deleted")
-
-
-def report_deletion(what: str, name: str, *, json: bool, undo: str = "") -> None:
+    client.send("DELETE", request_path(f"{what}s", name), params=params)
     print_result({"deleted": name, "kind": what}, f"{what} {name} is deleted", json=json)
     if undo and not json:
         typer.echo(f"`{undo}` restores it within the grace time (GRASPD_SHARD_GRACE_S)", err=True)
 
 
-def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
-    with open_client(url) as client:
-        found = client.send("POST", request_path(f"{what}s", name, "restore")).json()
+def restore(client: Client, what: str, name: str, *, json: bool) -> None:
+    found = client.send("POST", request_path(f"{what}s", name, "restore")).json()
     print_result({"restored": found["id"], "kind": what}, f"{what} {name} is restored", json=json)
 
 
 def print_rows(
-    document: dict[str, Any],
+    what: str,
+    found: Sequence[BaseModel | dict[str, Any]],
     headings: Sequence[str],
     rows: Sequence[Sequence[str]],
     *,
     whole: Collection[str] = (),
     empty: str = "",
     json: bool,
+    **more: Any,
 ) -> None:
-    """Print a list as JSON or as a table; `empty`: text for no rows; `whole`: columns without wrapping."""
+    """Print a list as `{what: [...], **more}` or as a table; `empty`: text for no rows; `whole`: no wrapping."""
     if json:
-        print_json(document)
+        items = [one.model_dump(mode="json") if isinstance(one, BaseModel) else one for one in found]
+        print_json({what: items, **more})
         return
     table = plain_table(*headings, whole=whole)
     for row in rows:
@@ -84,7 +111,7 @@ def print_rows(
 def watch(client: Client, job_id: str) -> JobDetail:
     """Return the job in its final state; show its progress on standard error meanwhile."""
     with JobDisplay(plain_console(stderr=True)) as display:
-        return client.wait(job_id, display.update)
+        return client.wait(job_id, display.show)
 
 
 def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True) -> None:
@@ -184,57 +211,38 @@ def _print_job(job: JobDetail, url: str) -> None:
 _LINE_EVERY_S: Final = 2.0
 
 
-class JobDisplay:
+class JobDisplay(Progress):
     """Context manager that shows a job's progress: bars on a terminal, elsewhere lines."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
-        self._progress = Progress(
+        columns = (
             TextColumn("{task.description:<11}"),
             BarColumn(bar_width=32),
             TextColumn("{task.percentage:>3.0f} %"),
             TextColumn("{task.fields[rate]}", style="cyan"),
             TimeRemainingColumn(compact=True, elapsed_when_finished=True),
             TextColumn("{task.fields[message]}", style="dim", markup=False),
-            console=console,
-            disable=not console.is_terminal,
         )
-        self._bars: dict[Stage, TaskID] = {}
+        super().__init__(*columns, console=console, disable=not console.is_terminal)
         self._said: dict[Stage, tuple[float, State]] = {}
-        self._started: dict[Stage, float] = {}
 
-    def __enter__(self) -> Self:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def update(self, job: Job) -> None:
+    def show(self, job: Job) -> None:
         for stage in job.stages:
-            now = time.monotonic()
-            if stage.state is not State.QUEUED:
-                self._started.setdefault(stage.stage, now)
-            seconds = now - self._started.get(stage.stage, now)
+            bar = next((one for one in self.tasks if one.description == stage.stage.value), None)
+            if bar is None:
+                self.add_task(stage.stage.value, total=stage.tasks, start=False, message="", rate="")
+                bar = self.tasks[-1]
+            if stage.state is not State.QUEUED and not bar.started:
+                self.start_task(bar.id)
+            seconds = bar.elapsed or 0.0
             rate = _rate_text(stage, job, seconds)
-            if self._console.is_terminal:
-                self._update_bar(stage, rate)
-            else:
-                self._print_state(stage, rate, seconds, now)
+            message = stage.message if stage.state is State.RUNNING else stage.state.value
+            self.update(bar.id, completed=stage.done, message=message, rate=rate)
+            if not self.console.is_terminal:
+                self._print_state(stage, rate, seconds)
 
-    def _update_bar(self, stage: StageStatus, rate: str) -> None:
-        if stage.stage not in self._bars:
-            self._bars[stage.stage] = self._progress.add_task(
-                stage.stage.value, total=stage.tasks, start=False, message="", rate=rate
-            )
-        bar = self._bars[stage.stage]
-        if stage.state is not State.QUEUED and not self._progress.tasks[bar].started:
-            self._progress.start_task(bar)
-        message = stage.message if stage.state is State.RUNNING else stage.state.value
-        self._progress.update(bar, completed=stage.done, message=message, rate=rate)
-
-    def _print_state(self, stage: StageStatus, rate: str, seconds: float, now: float) -> None:
-        at, state = self._said.get(stage.stage, (0.0, State.QUEUED))
+    def _print_state(self, stage: StageStatus, rate: str, seconds: float) -> None:
+        now, (at, state) = time.monotonic(), self._said.get(stage.stage, (0.0, State.QUEUED))
         if stage.state is state and (state is not State.RUNNING or now - at < _LINE_EVERY_S):
             return
         self._said[stage.stage] = (now, stage.state)
@@ -243,7 +251,7 @@ class JobDisplay:
             words += f"  {rate}  in {duration(stage.seconds or seconds)}"
         elif rate:
             words += f"  {rate}  {duration(seconds / stage.progress - seconds)} left"
-        self._console.print(words)
+        self.console.print(words)
 
 
 def _rate_text(stage: StageStatus, job: Job, seconds: float) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from graspd.service.model.states import Stage
-from graspd.service.run.doctor.checks import Check, Finding, bad, good, warning
+from graspd.service.run.doctor.checks import Finding, bad, good, warning
 from graspd.service.settings import Settings
 
 _GPU_S: Final = 120.0
@@ -22,14 +22,6 @@ _GIB: Final = 2**30
 _MEMORY_LOW: Final = 2 * _GIB
 _TRACES: Final = (Path("/proc/driver/nvidia/version"), Path("/dev/nvidiactl"))
 Child = Callable[[Sequence[str]], "subprocess.CompletedProcess[str]"]
-
-
-def checks_of(settings: Settings) -> list[Check]:
-    hung = "restart the driver, or the machine; see dmesg"
-    return [
-        Check("gpu", lambda: check_gpu(settings), limit_s=_GPU_S + 5, mend_hang=hung),
-        Check("kernels", lambda: check_kernels(settings), limit_s=_KERNELS_S + 5, mend_hang="see `top`, then retry"),
-    ]
 
 
 def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:

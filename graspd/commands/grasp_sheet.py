@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,26 +76,26 @@ class GraspSheet:
 
     def _strip_pictures(self) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
         """Return the names of the postures, and their pictures (N, F, H, W, 3)."""
-        trajectories = [trajectory_of(self.shard, int(row)) for row in self.rows]
-        names = STRIP if any(point.name == "lift" for point in trajectories[0]) else FREE_STRIP
-        drawn = self._render([[_waypoint(trajectory, name) for name in names] for trajectory in trajectories], 1)
-        return names, drawn[:, 0]
+        names = (
+            STRIP if any(point.name == "lift" for point in trajectory_of(self.shard, int(self.rows[0]))) else FREE_STRIP
+        )
+        return names, self._render(names, 1)[:, 0]
 
     def _grasp_pictures(self) -> NDArray[np.uint8]:
         """Return pictures at the grasp (N, A, H, W, 3)."""
         sides = 3 if self.kind == "three sides" else 1
         if self.scene:
-            trajectories = [trajectory_of(self.shard, int(row)) for row in self.rows]
-            return self._render([[_waypoint(trajectory, "grasp")] for trajectory in trajectories], sides)[:, :, 0]
+            return self._render(("grasp",), sides)[:, :, 0]
         shown, samples = Posture.from_columns(self.shard.arrays).take(self.rows), LOOKS[self.kind][1]
         at = (shown.hand_pose, shown.joint_positions, self.size, THREE_SIDES[:sides])
         return grasp_pictures(self.hand, self.obj, *at, run=self.run, samples=samples)
 
-    def _render(self, frames: list[list[Waypoint]], sides: int) -> NDArray[np.uint8]:
-        around, samples = surroundings_of(self.shard, self.rows), LOOKS[self.kind][1]
-        return trajectory_pictures(
-            self.hand, self.obj, frames, around, self.size, sides=sides, run=self.run, samples=samples
-        )
+    def _render(self, names: Sequence[str], sides: int) -> NDArray[np.uint8]:
+        """Return pictures (N, A, F, H, W, 3) of the named points of the trajectories."""
+        named = [{point.name: point for point in reversed(trajectory_of(self.shard, int(row)))} for row in self.rows]
+        frames, around = [[points[name] for name in names] for points in named], surroundings_of(self.shard, self.rows)
+        seen: dict[str, Any] = {"sides": sides, "run": self.run, "samples": LOOKS[self.kind][1]}
+        return trajectory_pictures(self.hand, self.obj, frames, around, self.size, **seen)
 
 
 def surroundings_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
@@ -105,10 +105,6 @@ def surroundings_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
     poses = np.asarray(shard["scene/object_pose"], float)
     index = np.asarray(shard["grasp/scene_index"], np.intp)[rows]
     return PictureScenes(scene_supports(spec), poses, index, neighbours_of_shard(shard, []), wrist_angles(shard, rows))
-
-
-def _waypoint(trajectory: list[Waypoint], name: str) -> Waypoint:
-    return next(point for point in trajectory if point.name == name)
 
 
 #: Width of the animation [px], and its height as a share of the width.

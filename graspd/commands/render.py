@@ -18,7 +18,6 @@ from graspd.commands.grasp_sheet import GraspAnimation, GraspSheet, Kind
 from graspd.service.cli import CommandGroup, JsonFlag, print_result, progress_bar, write_output
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import scene_supports
-from graspd.service.model.transforms import compose
 from graspd.service.readers.trajectories import scene_spec_of, wrist_angles
 from graspd.service.run.commands import stop_on_signals
 from graspd.service.store import validity
@@ -82,7 +81,7 @@ def render(
         channels=parse_channels(channels.split(",")),
         cameras=given,
         neighbours=neighbours_of_shard(scene, with_ or []),
-        drawn=_best_grasps(scene, hand) if scene.kind == "base" else _hand_in_pictures(scene, with_hand, hand),
+        drawn=_drawn_hand(scene, with_hand, hand),
         supports=TABLE if spec is None else scene_supports(spec),
     )
     with progress_bar(quiet=json) as progress:
@@ -179,19 +178,11 @@ def _load_scenes(path: Path) -> Shard:
     return shard
 
 
-def _best_grasps(base: Shard, hand: str | None) -> DrawnHand | None:
-    """Return the best valid grasp of each scene; of an unvalidated shard, the best feasible grasp."""
-    validated = validity.valid_mask(base.arrays).any()
-    rows = sheets.best_in_scenes(base.arrays, validity.selection_mask(base.arrays, unvalidated=not validated))
-    if not len(base["grasp/hand_pose"]):
-        return None
-    poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
-    placed = compose(np.asarray(base["scene/object_pose"], float), poses)
-    return DrawnHand(hand_of_shard(base, hand), rows, placed, joints, wrist_angles(base, rows))
-
-
-def _hand_in_pictures(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
-    """Return the best clear grasp of each scene by epsilon, for `--with-hand`."""
+def _drawn_hand(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
+    """Return the best grasp of each scene: of a base shard a valid one, else a clear one for `--with-hand`."""
+    if scene.kind == "base":
+        unvalidated = not validity.valid_mask(scene.arrays).any()
+        return sheets.best_grasps_drawn(scene, hand_of_shard(scene, hand), unvalidated=unvalidated)
     source = np.asarray(scene["grasp/base_index"])
     if base_file is None or not len(source):
         return None

@@ -121,8 +121,7 @@ def _measure_maps(names: tuple[str, ...], hand: str, *, quick: bool, threads: in
     from graspd.studies.stability.shapes import run_studies
 
     maps = run_studies(names, hand, quick=quick, work=ExecutionContext(threads=threads), say=_echo)
-    command = shlex.join(["graspd", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])
-    return Stability(timestamp(), command, {"graspd": PACKAGE_VERSION, "warp": wp.__version__}, maps)
+    return Stability(timestamp(), _command_line(), {"graspd": PACKAGE_VERSION, "warp": wp.__version__}, maps)
 
 
 def _read_record(path: Path, kind: str, parse: Callable[[Any], Any]) -> Any:
@@ -246,7 +245,7 @@ def chart(
     sizes: dict[str, Any] = {"batches": batches, "baseline_batch": baseline_batch}
     chosen = settings_of(_parts(methods), levels, options=option or [], quick=quick, run=on, **sizes)
     models, things = [hand_from_path(part) for part in _parts(hands)], _chart_objects(_parts(objects))
-    said = {"command": shlex.join(["graspd", *(_without_folders(word) for word in sys.argv[1:])]), "remark": remark}
+    said = {"command": _command_line(), "remark": remark}
 
     def save_partial(so_far: dict[str, Any]) -> None:
         if out is not None:
@@ -281,15 +280,16 @@ def _read_chart(path: Path) -> dict[str, Any]:
     return found
 
 
-def _without_folders(word: str) -> str:
-    """Remove local folders from a word of the command line, because they differ between machines."""
+def _command_line() -> str:
+    """Return the command without local folders, because they differ between machines."""
 
     def shorten_path(part: str) -> str:
         if "/data/" in part:
             return "DATA/" + part.split("/data/", 1)[1]
         return Path(part).name if part.startswith("/") else part
 
-    return ",".join(shorten_path(part) for part in word.split(","))
+    words = (",".join(map(shorten_path, word.split(","))) for word in sys.argv[1:])
+    return shlex.join(["graspd", *words])
 
 
 def _parts(text: str) -> list[str]:

@@ -185,7 +185,7 @@ def test_hands_of_grasps_in_scenes_are_drawn_with_their_wrists(base: Path):
     at = {"scene/object_pose": np.tile([0.0, 0, 0, 1, 0, 0, 0], (GRASPS, 1)), "grasp/scene_index": np.arange(GRASPS)}
     shard.arrays.update(at | {"grasp/wrist_positions": wrist})
     shard.attributes["scene"] = json_attribute({"kind": "table"})
-    around, drawn = grasp_sheet.surroundings_of(shard, np.array([2, 0])), render._best_grasps(shard, None)
+    around, drawn = grasp_sheet.surroundings_of(shard, np.array([2, 0])), render._drawn_hand(shard, None, None)
     assert np.array_equal(around.wrist, wrist[[2, 0]])
     assert np.array_equal(drawn.wrist, wrist)
 

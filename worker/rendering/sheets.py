@@ -9,9 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from graspd.service.model.transforms import Floats
+from graspd.service.model.transforms import Floats, compose
+from graspd.service.readers.trajectories import wrist_angles
+from graspd.service.store import validity
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
+from graspd.service.store.shards import Shard
+from graspd.worker.hands.model import HandModel
 from graspd.worker.rendering.annotate import OBJECT, TABLE
+from graspd.worker.rendering.hands import DrawnHand
 
 MARGIN: Final = 40
 GAP: Final = 18
@@ -45,6 +50,17 @@ def best_in_scenes(base: Arrays, among: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Return the row (S,) of each scene with the largest epsilon among a mask (N,); -1 if it has none."""
     epsilon = np.nan_to_num(metric_at_threshold(base, "quality/epsilon"), nan=-1.0)
     return _best_of_scenes(base, np.where(among, epsilon, -np.inf))
+
+
+def best_grasps_drawn(base: Shard, hand: HandModel, *, unvalidated: bool) -> DrawnHand | None:
+    """Return the best valid grasp of each scene, if `unvalidated` the best feasible one; None without grasps."""
+    among = validity.selection_mask(base.arrays, unvalidated=unvalidated)
+    if not len(among):
+        return None
+    rows = best_in_scenes(base.arrays, among)
+    poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
+    placed = compose(np.asarray(base["scene/object_pose"], float), poses)
+    return DrawnHand(hand, rows, placed, joints, wrist_angles(base, rows))
 
 
 def _best_of_scenes(columns: Arrays, score: Floats) -> NDArray[np.int32]:

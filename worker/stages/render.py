@@ -7,14 +7,10 @@ import numpy as np
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.scene_spec import scene_supports
 from graspd.service.model.states import Stage
-from graspd.service.model.transforms import compose
-from graspd.service.readers.trajectories import wrist_angles
-from graspd.service.store import validity
 from graspd.service.store.columns import Attribute
-from graspd.service.store.shards import Shard, json_attribute
+from graspd.service.store.shards import json_attribute
 from graspd.worker.rendering import Extras, render
-from graspd.worker.rendering.hands import DrawnHand
-from graspd.worker.rendering.sheets import best_in_scenes
+from graspd.worker.rendering.sheets import best_grasps_drawn
 from graspd.worker.scenes.neighbours import Neighbours
 from graspd.worker.stages.assets import hand_of, load_input, neighbour_attributes, neighbours_of, object_of
 from graspd.worker.stages.context import Output, TaskContext, batch_seed
@@ -31,7 +27,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     if request.in_scene:
         others = neighbours_of(context.store, message)
         beside = Neighbours(others, np.asarray(shard["scene/neighbour_pose"], float)) if others else None
-        drawn = _select_drawn_hand(shard, message, context)
+        drawn = best_grasps_drawn(shard, hand_of(context.store, message), unvalidated=request.validation == "none")
         extras = replace(extras, supports=scene_supports(request.scene_spec), drawn=drawn, neighbours=beside)
         attributes = {"base_shard": message.inputs[0], "scene": json_attribute(request.scene_spec.to_attribute())}
         attributes |= neighbour_attributes(message)
@@ -48,15 +44,3 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         extras=extras,
     )
     return Output(pictures, attributes)
-
-
-def _select_drawn_hand(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand | None:
-    """Select the best valid grasp of each scene; return None if the shard has no grasps."""
-    hand = hand_of(context.store, message)
-    among = validity.selection_mask(base.arrays, unvalidated=message.request.validation == "none")
-    rows = best_in_scenes(base.arrays, among)
-    if not len(among):
-        return None
-    poses = np.asarray(base["scene/object_pose"], float)
-    hand_poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
-    return DrawnHand(hand, rows, compose(poses, hand_poses), joints, wrist_angles(base, rows))

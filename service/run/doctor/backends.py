@@ -2,9 +2,9 @@
 
 import secrets
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, closing
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
@@ -21,7 +21,7 @@ from graspd.service.model import errors
 from graspd.service.model.base import first_line
 from graspd.service.pipeline.identity import ServiceIdentity, recorded_service, service_ids
 from graspd.service.queue.connection import connect, redis_url, socket_path
-from graspd.service.queue.rq_queue import open_queue
+from graspd.service.queue.rq_queue import RqQueue, open_queue
 from graspd.service.run.doctor.checks import Finding, bad, good, skipped, warning
 from graspd.service.run.doctor.machine import existing_ancestor, local_store
 from graspd.service.run.embedded import find_server
@@ -41,8 +41,14 @@ def is_redis_expected(settings: Settings) -> bool:
     return settings.redis_url is not None or socket_path(settings.data_dir).exists()
 
 
-def redis_connection(settings: Settings) -> AbstractContextManager[Redis]:
-    return closing(connect(redis_url(settings), patience=0, timeout_s=_TIMEOUT_S))
+def query_queue(settings: Settings, look: Callable[[RqQueue], Finding]) -> Finding:
+    if not is_redis_expected(settings):
+        return skipped("no service runs on this data folder")
+    try:
+        with closing(open_queue(settings, patience=0)) as queue:
+            return look(queue)
+    except (errors.QueueUnavailable, RedisError, OSError):
+        return skipped("Redis does not answer")
 
 
 def check_redis(settings: Settings) -> Finding:
@@ -54,7 +60,7 @@ def check_redis(settings: Settings) -> Finding:
             return bad("no service runs on this data folder, and there is no Redis to start", str(error))
         return skipped(f"no service runs on this data folder; `graspd up` starts the Redis of {rung}")
     try:
-        with redis_connection(settings) as client:
+        with closing(connect(redis_url(settings), patience=0, timeout_s=_TIMEOUT_S)) as client:
             return _check_redis(settings, client, dict(client.info()))
     except (RedisError, OSError) as error:
         return bad(f"{_masked_url(settings)} does not answer: {first_line(error)}", _redis_fix(error, settings))
@@ -102,13 +108,10 @@ def _time_write(client: Redis) -> float:
 
 def check_persistence(settings: Settings) -> Finding:
     """Check whether Redis restores its tasks after a crash."""
-    if not is_redis_expected(settings):
-        return skipped("no service runs on this data folder; the Redis of `graspd up` keeps a log of writes")
-    try:
-        with redis_connection(settings) as client:
-            info = dict(client.info())
-    except (RedisError, OSError):
-        return skipped("Redis does not answer")
+    return query_queue(settings, lambda queue: _check_persistence(dict(queue.connection.info())))
+
+
+def _check_persistence(info: Mapping[str, Any]) -> Finding:
     fix = "make room on the disk of Redis and see its log"
     if int(info.get("aof_enabled", 0)):
         for what in ("aof_last_write_status", "aof_last_bgrewrite_status"):
@@ -324,13 +327,8 @@ def _violated_guarantee(opened: Store, key: str) -> str:
     if sum(won) != 1:
         return f"{sum(won)} of {_RIVALS} concurrent puts of one name succeeded instead of 1: data could be overwritten"
     kept = contents[won.index(True)]
-    try:
-        if opened.get(key) != kept:
-            return "an object is read differently from how it was written"
-        if opened.get_range(key, 100, 50) != kept[100:150]:
-            return "a byte range of an object is read wrongly"
-    except errors.NotFoundError:
-        return "an object is missing right after it was written"
+    if opened.get(key) != kept or opened.get_range(key, 100, 50) != kept[100:150]:
+        return "an object or a byte range of it is read differently from how it was written"
     if opened.put(key, b"another") or opened.get(key) != kept:
         return "an object can be overwritten: create-only puts (If-None-Match: *) are not honoured"
     if (key, len(kept)) not in [(entry.key, entry.size) for entry in opened.list(_FOLDER)]:

@@ -11,21 +11,21 @@ import time
 import urllib.error
 import urllib.request
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, suppress
 from datetime import datetime
 from typing import Any, Final
 
 from redis.exceptions import RedisError
 
-from graspd.service.model.errors import GraspdError, QueueUnavailable
+from graspd.service.model.errors import GraspdError
 from graspd.service.model.messages import WorkerHeartbeat
 from graspd.service.model.states import Stage
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.rq_queue import RqQueue, open_queue
 from graspd.service.run.address import local_url, recorded_address
-from graspd.service.run.doctor.backends import is_redis_expected, redis_connection
+from graspd.service.run.doctor.backends import is_redis_expected, query_queue
 from graspd.service.run.doctor.checks import Finding, bad, good, skipped, warning
 from graspd.service.run.doctor.machine import local_store
 from graspd.service.settings import Settings
@@ -34,24 +34,14 @@ from graspd.service.store.store import open_store
 _HTTP_S: Final = 5.0
 
 
-def _query_queue(settings: Settings, look: Callable[[RqQueue], Finding]) -> Finding:
-    if not is_redis_expected(settings):
-        return skipped("no service runs on this data folder")
-    try:
-        with closing(open_queue(settings, patience=0)) as queue:
-            return look(queue)
-    except QueueUnavailable:
-        return skipped("Redis does not answer")
-
-
 def check_controller(settings: Settings) -> Finding:
     dead = bad("no heartbeat from a controller: nothing is indexed or queued", "graspd controller")
-    return _query_queue(settings, lambda queue: good("a controller is alive") if queue.is_announced(PART) else dead)
+    return query_queue(settings, lambda queue: good("a controller is alive") if queue.is_announced(PART) else dead)
 
 
 def check_workers(settings: Settings) -> Finding:
     """Check that workers are healthy, have this version and serve every stage with waiting tasks."""
-    return _query_queue(settings, lambda queue: _check_workers(queue.workers(), _waiting_tasks(queue)))
+    return query_queue(settings, lambda queue: _check_workers(queue.workers(), _waiting_tasks(queue)))
 
 
 def _waiting_tasks(queue: RqQueue) -> Counter[Stage]:
@@ -142,15 +132,13 @@ def check_clocks(settings: Settings) -> Finding:
 def _clock_offsets(settings: Settings) -> Iterator[tuple[str, float]]:
     """Yield names and clock offsets to this machine [s]; other checks report missing parts."""
     if is_redis_expected(settings):
-        with suppress(RedisError, OSError), redis_connection(settings) as client:
+        with suppress(GraspdError, RedisError, OSError), closing(open_queue(settings, patience=0)) as queue:
             before = time.time()
-            seconds, micros = client.time()
+            seconds, micros = queue.connection.time()
             yield "Redis", seconds + micros / 1e6 - (before + time.time()) / 2
-        with suppress(GraspdError), closing(open_queue(settings, patience=0)) as queue:
-            beats = queue.workers()
             # An age up to the next heartbeat is normal; only the excess is a clock offset.
             due = 4 / 3 * settings.lease_s
-            ages = {beat.host: time.time() - _unix_seconds(beat.seen) for beat in beats}
+            ages = {beat.host: time.time() - _unix_seconds(beat.seen) for beat in queue.workers()}
             yield from ((host, -age if age < 0 else min(0.0, due - age)) for host, age in ages.items())
     folder = local_store(settings)
     if folder is None or folder.exists():

@@ -80,7 +80,7 @@ def test_without_a_terminal_progress_is_plain_lines() -> None:
     numbers = {"requested": 32, "grasps": 0, "valid": 0, "progress": 0.5}
     with JobDisplay(Console(file=screen)) as display:
         for stage in (running, ended):
-            display.update(Job(**words, **numbers, state=State.RUNNING, stages=[status_of(stage)]))
+            display.show(Job(**words, **numbers, state=State.RUNNING, stages=[status_of(stage)]))
     first, last = screen.getvalue().splitlines()
     assert ("running" in first, "50 %" in first) == (True, True)
     assert ("succeeded" in last, "8.0 s" in last) == (True, True)

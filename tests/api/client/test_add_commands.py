@@ -7,10 +7,9 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from graspd.client import add_commands
+from graspd.client import reports
 from graspd.client.add_commands import add_object, upload_of
 from graspd.client.client import Client
-from graspd.service.cli import CommandGroup
 from graspd.service.index.views import AssetView
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
@@ -37,8 +36,8 @@ def add(monkeypatch: pytest.MonkeyPatch, http: TestClient, *arguments: str) -> t
     client = Client("http://127.0.0.1:8000")
     client._http = http
     monkeypatch.setattr(client, "close", lambda: None)
-    monkeypatch.setattr(add_commands, "open_client", lambda url: client)
-    app = CommandGroup()
+    monkeypatch.setattr(reports, "open_client", lambda url: client)
+    app = reports.ClientGroup()
     app.command()(add_object)
     waiting = [] if "--split" in arguments else ["--no-wait"]
     result = CliRunner().invoke(app, [*arguments, *waiting, "--json"])
@@ -80,7 +79,7 @@ def test_a_split_makes_a_set_of_each_side(monkeypatch: pytest.MonkeyPatch, http:
     add(monkeypatch, http, str(folder), "--split")
     sets = {name: http.get(f"/v1/object-sets/{name}").json()["objects"] for name in ("ycb", "ycb-train", "ycb-report")}
     assert sets == {"ycb": ["003_cracker_box", "025_mug"], "ycb-train": ["003_cracker_box"], "ycb-report": ["025_mug"]}
-    app = CommandGroup()
+    app = reports.ClientGroup()
     app.command()(add_object)
     refused = CliRunner().invoke(app, [str(folder), "--split", "--no-wait"])
     assert refused.exit_code == 2 and "--split needs the checks" in refused.output

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 from rich.console import Console
-from rich.progress import Progress
 from typer.testing import CliRunner
 
 from graspd.cli import build_app
@@ -64,8 +63,7 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
     def opened(_: str | None) -> Iterator[Service]:
         yield Service()
 
-    for module in ("reports", "tag_commands", "access_commands"):
-        monkeypatch.setattr(f"graspd.client.{module}.open_client", opened)
+    monkeypatch.setattr("graspd.client.reports.open_client", opened)
 
     def run(*arguments: str) -> list[str]:
         done = CliRunner().invoke(build_app(), arguments, env={"COLUMNS": "80"})
@@ -99,10 +97,9 @@ def test_progress_shows_messages_as_they_are(monkeypatch: pytest.MonkeyPatch) ->
     console = plain_console()
     monkeypatch.setattr(type(console), "is_terminal", True)
     display = JobDisplay(console)
-    progress: Progress = display._progress
-    progress.add_task("render", total=1, message="[red]mug[/] [/nothing]", rate="")
+    display.add_task("render", total=1, message="[red]mug[/] [/nothing]", rate="")
     with console.capture() as got:
-        console.print(progress)
+        console.print(display)
     assert "[red]mug[/] [/nothing]" in got.get()
 
 
