@@ -6,19 +6,43 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, count
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from typer import Option
 
 from graspd.service.model.names import shorten_name
 from graspd.service.model.transforms import Floats, compose, invert, pose_from_matrix
 from graspd.service.readers import Pictures
 from graspd.service.store.shards import Shard
+from graspd.worker.files.subsets import EveryOption, UnvalidatedOption
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Options of `graspd export`."""
+
+    hand: Annotated[str | None, Option(help="Hand file; default: found by its digest.")] = None
+    obj: Annotated[str | None, Option("--object", help="Object file; default: found by its digest.")] = None
+    unvalidated: UnvalidatedOption = False
+    every: EveryOption = False
+    depth: Annotated[str, Option(help="Depth: exr (float, metres) or png (16 bit, steps of 0.1 mm).")] = "exr"
+    best: Annotated[int, Option(min=0, help="For robots: number of best grasps by epsilon; 0: all.")] = 0
+    tool: Annotated[
+        str | None, Option("--tool-frame", help="For robots: link of the hand, or x y z qw qx qy qz in its root.")
+    ] = None
+    speed: Annotated[float, Option(help="For robots: share of the velocity limits.")] = 0.5
+    arm: Annotated[str | None, Option(help="For robots: ur10e, franka or a URDF; grasps in reach.")] = None
+    mount: Annotated[str | None, Option(help="Link of the arm on which the hand is mounted.")] = None
+    base: Annotated[str | None, Option(help="Pose of the arm's base in the scene or object: x y z qw qx qy qz.")] = None
+    mount_pose: Annotated[str | None, Option(help="Pose of the hand in the mount: x y z qw qx qy qz.")] = None
+    held_out: Annotated[float, Option(help="For training and splits: share of held-out objects.")] = 0.2
+    noise: Annotated[str, Option(help="For training: noise of depth, stereo or structured_light.")] = ""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """Export of a shard's grasps with their trajectories in the format of a robot or simulator."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.exchange.inputs import load_case
-from graspd.exchange.plan import ExportSummary
+from graspd.exchange.plan import ExportOptions, ExportSummary
 from graspd.exchange.robots.bundle import Bundle, Carrier
 from graspd.service.model.errors import InputError
 from graspd.service.store.shards import Shard, read_shard
@@ -32,24 +31,7 @@ from graspd.worker.rendering.sheets import metric_at_threshold
 from graspd.worker.validation.decomposition import decompose
 
 
-@dataclass(frozen=True)
-class RobotExportOptions:
-    """Options of `graspd export` for robots."""
-
-    hand: str | None = None
-    obj: str | None = None
-    unvalidated: bool = False
-    every: bool = False
-    best: int = 0  # largest number of grasps, best epsilon first; 0 for all, in the order of the shard
-    tool: str | None = None
-    speed: float = 0.5  # share of the velocity limits that trajectories use
-    arm: str | None = None  # description of the arm; the next three fields place the arm and mount the hand
-    mount: str | None = None
-    base: str | None = None
-    mount_pose: str | None = None
-
-
-def export_grasps(source: Path, format_: str, wishes: RobotExportOptions, folder: Path) -> ExportSummary:
+def export_grasps(source: Path, format_: str, wishes: ExportOptions, folder: Path) -> ExportSummary:
     """Write grasps of a base shard in the format of a robot or its simulator.
     Raises InputError: options contradict each other, or no grasp can be executed."""
     if not 0 < wishes.speed <= 1:
@@ -81,7 +63,7 @@ def _plan_for_arm(
     found: Executions,
     description: HandDescription,
     limits: VelocityLimits,
-    wishes: RobotExportOptions,
+    wishes: ExportOptions,
     written: ExportSummary,
 ) -> Bundle:
     # Poses of an arm from a file have no default but the identity.
@@ -114,7 +96,7 @@ def _plan_for_arm(
 
 
 def _plan_executions(
-    source: Path, shard: Shard, description: HandDescription, wishes: RobotExportOptions, written: ExportSummary
+    source: Path, shard: Shard, description: HandDescription, wishes: ExportOptions, written: ExportSummary
 ) -> Executions:
     case = load_case(source, hand=wishes.hand, obj=wishes.obj)
     mask, word = select_grasps(shard, unvalidated=wishes.unvalidated, every=wishes.every)

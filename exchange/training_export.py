@@ -4,7 +4,6 @@ Objects of a family have similar distributions of the distance between two rando
 "Shape distributions", 2002), relative to its root mean square. Moved, mirrored, scaled or remeshed copies are equal."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from graspd.exchange.inputs import case_of_shard
 from graspd.exchange.lerobot import EpisodesPart
-from graspd.exchange.plan import ExportPart, ExportSummary, held_out_objects, plain_name
+from graspd.exchange.plan import ExportOptions, ExportPart, ExportSummary, held_out_objects, plain_name
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 from graspd.service.readers import Pictures, Shards
@@ -26,19 +25,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 
 
-@dataclass(frozen=True)
-class TrainingExportOptions:
-    """Options of `graspd export` for training formats."""
-
-    hand: str | None = None
-    obj: str | None = None
-    unvalidated: bool = False
-    every: bool = False
-    held_out: float = 0.2
-    noise: str = ""  # name of a depth camera; empty for perfect depth
-
-
-def export_training(source: str, format_: str, wishes: TrainingExportOptions, folder: Path) -> ExportSummary:
+def export_training(source: str, format_: str, wishes: ExportOptions, folder: Path) -> ExportSummary:
     """Write the grasps of all shards of a folder or a dataset in a training format.
     Raises InputError: the share is invalid, no shard has suitable grasps, or the format refuses them."""
     from graspd.exchange import dexlearn, graspgen, huggingface, lerobot
@@ -57,7 +44,7 @@ def export_training(source: str, format_: str, wishes: TrainingExportOptions, fo
     return writer(lots, pictures, folder, out, parse_depth_noise(wishes.noise or None))
 
 
-def export_bench(source: str, wishes: TrainingExportOptions, split: str, folder: Path) -> ExportSummary:
+def export_bench(source: str, wishes: ExportOptions, split: str, folder: Path) -> ExportSummary:
     """Write grasps of a split (`train`, `test`; "": all) in DexGraspBench's layout, shard by shard.
     Raises InputError like `export_training`, or the split is empty."""
     from graspd.exchange.dexgraspbench import BenchExport
@@ -75,7 +62,7 @@ def export_bench(source: str, wishes: TrainingExportOptions, split: str, folder:
     return ExportSummary({"grasps": count, "objects": len(writer.objects), "files": count})
 
 
-def export_parts(shards: Shards, format_: str, wishes: TrainingExportOptions) -> Iterator[ExportPart]:
+def export_parts(shards: Shards, format_: str, wishes: ExportOptions) -> Iterator[ExportPart]:
     """Yield the selected grasps of each base shard; hands and one object at a time stay in memory.
     Raises InputError: no shard has such grasps."""
     digests: dict[str, str] = {}
@@ -108,7 +95,7 @@ def export_parts(shards: Shards, format_: str, wishes: TrainingExportOptions) ->
 _MODELS: Final = ("hand_digest", "object_digest", "object_mass_kg", "object_friction", "fidelity")
 
 
-def _exported_rows(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.ndarray:
+def _exported_rows(shard: Shard, format_: str, wishes: ExportOptions) -> np.ndarray:
     """Return a mask (N,) of exported grasps: with failed ones for GraspGen, whose format has labels."""
     if format_ != "graspgen":
         return select_grasps(shard, unvalidated=wishes.unvalidated, every=wishes.every)[0]

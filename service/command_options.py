@@ -5,7 +5,8 @@ import inspect
 import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import Annotated, Any
+from dataclasses import fields
+from typing import Annotated, Any, get_type_hints
 
 import typer
 from pydantic import BaseModel
@@ -27,6 +28,24 @@ def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[...
         own = list(inspect.signature(command, eval_str=True).parameters.values())
         at = [parameter.name for parameter in own].index("options")
         return set_parameters(wrapper, [*own[:at], *map(_option_parameter, added), *own[at + 1 :]])
+
+    return decorate
+
+
+def with_fields(model: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorate a command: its parameter `options`, a dataclass with annotated fields, becomes one option per field."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def wrapper(**given: Any) -> None:
+            options = model(**{name: given.pop(name) for name in types})
+            command(**given, options=options)
+
+        types = {one.name: (one.default, get_type_hints(model, include_extras=True)[one.name]) for one in fields(model)}
+        own = list(inspect.signature(command, eval_str=True).parameters.values())
+        at, by_name = [parameter.name for parameter in own].index("options"), inspect.Parameter.KEYWORD_ONLY
+        added = [inspect.Parameter(name, by_name, default=one, annotation=kind) for name, (one, kind) in types.items()]
+        return set_parameters(wrapper, [*own[:at], *added, *own[at + 1 :]])
 
     return decorate
 

@@ -11,6 +11,7 @@ import numpy as np
 import typer
 
 from graspd.service.cli import CommandGroup, JsonFlag, print_result, progress_bar, write_output
+from graspd.service.command_options import with_fields
 from graspd.service.store.shards import read_shard, write_shard
 from graspd.worker.episodes.episode import EpisodeOutcome
 from graspd.worker.episodes.film import cameras_attribute, film_maker, film_options
@@ -28,17 +29,13 @@ ThreadsOption = Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per
 
 
 @group.command(epilog="graspd episodes create grasps.h5 --arm ur10e -o episodes.h5")
+@with_fields(EpisodeOptions)
 def create(
     grasps: Annotated[Path, typer.Argument(help="Base shard with grasps in scenes, as of `synth --scene table`.")],
-    arm: Annotated[str | None, typer.Option(help="ur10e, franka or a URDF; default: the hand flies.")] = None,
-    mount: Annotated[str | None, typer.Option(help="Link of the arm on which the hand is mounted.")] = None,
-    mount_pose: Annotated[str | None, typer.Option(help="Pose of the hand in the mount: x y z qw qx qy qz.")] = None,
-    base: Annotated[str | None, typer.Option(help="Pose of the arm's base in the scene: x y z qw qx qy qz.")] = None,
     hand: HandOption = None,
     object: ObjectOption = None,
-    fps: Annotated[float, typer.Option(min=5, max=60, help="Rate of frames [Hz].")] = EpisodeOptions.fps,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of start postures and motions.")] = 0,
-    limit: Annotated[int, typer.Option(min=0, help="Number of valid grasps, from the first; 0: all.")] = 0,
+    *,
+    options: EpisodeOptions,
     film: Annotated[str, typer.Option(help="Cameras that film episodes: scene,wrist,moving; default: none.")] = "",
     size: Annotated[str, typer.Option(help="Width and height of films [px].")] = "320x240",
     channels: Annotated[str, typer.Option(help="Further videos of each camera: depth,segmentation.")] = "",
@@ -48,15 +45,14 @@ def create(
 ) -> None:
     """Execute the valid grasps of a file, from the transit to the hold; failures remain, labelled."""
     shard = read_shard(grasps, kind="base")
-    options = EpisodeOptions(arm, mount, mount_pose, base, fps, seed, limit)
     model, thing = hand_of_shard(shard, hand), object_of_shard(shard, object)
     with progress_bar(quiet=json) as report:
         run = ExecutionContext(threads=threads, progress=report)
-        filmed = film_maker(shard, film_options(film, size, channels, fps), seed, run) if film else None
+        filmed = film_maker(shard, film_options(film, size, channels, options.fps), options.seed, run) if film else None
         placed = scenes_of_shard(shard)
         columns, attributes = record_episodes(shard, model, thing, placed, options, film=filmed, run=run)
     if film:
-        attributes["cameras"] = cameras_attribute(film_options(film, size, channels, fps))
+        attributes["cameras"] = cameras_attribute(film_options(film, size, channels, options.fps))
     attributes["shard_id"] = id_of_columns(columns)
     write_output(output, write_shard("episodes", columns, attributes))
     counts, frames = count_outcomes(columns["episode/outcome"]), columns["episode/frames"]

@@ -11,15 +11,16 @@ import numpy as np
 import typer
 
 from graspd.exchange.opening import check_written_files
-from graspd.exchange.plan import ExportSummary
+from graspd.exchange.plan import ExportOptions, ExportSummary
 from graspd.service.cli import CommandGroup, DataDir, JsonFlag, load_settings, print_result, progress_bar
+from graspd.service.command_options import with_fields
 from graspd.service.model.errors import InputError, choices_text
 from graspd.service.store import validity
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import open_store
 from graspd.service.store.usd_layers import import_usd
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, open_source
+from graspd.worker.files.subsets import EveryOption, open_source
 
 if TYPE_CHECKING:
     from graspd.studies.cards.contents import Contents
@@ -34,59 +35,42 @@ IMPORTS: Final = ("dexgraspbench", "dexlearn", "graspgen", "dexgraspnet", "multi
 
 
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
+@with_fields(ExportOptions)
 def export(
     source: Annotated[
         str, typer.Argument(help="Shard; for dexgraspbench, webdataset and training a folder or dataset, too.")
     ],
     format_: Annotated[str, typer.Option("--format", help=", ".join(EXPORTS) + ".")] = "images",
-    hand: Annotated[str | None, typer.Option(help="Hand file; default: found by its digest.")] = None,
-    object_: Annotated[str | None, typer.Option("--object", help="Object file; default: found by its digest.")] = None,
-    unvalidated: UnvalidatedOption = False,
-    every: EveryOption = False,
-    depth: Annotated[str, typer.Option(help="Depth: exr (float, metres) or png (16 bit, steps of 0.1 mm).")] = "exr",
-    best: Annotated[int, typer.Option(min=0, help="For robots: number of best grasps by epsilon; 0: all.")] = 0,
-    tool: Annotated[
-        str | None, typer.Option("--tool-frame", help="For robots: link of the hand, or x y z qw qx qy qz in its root.")
-    ] = None,
-    speed: Annotated[float, typer.Option(help="For robots: share of the velocity limits.")] = 0.5,
-    arm: Annotated[str | None, typer.Option(help="For robots: ur10e, franka or a URDF; grasps in reach.")] = None,
-    mount: Annotated[str | None, typer.Option(help="Link of the arm on which the hand is mounted.")] = None,
-    base: Annotated[
-        str | None, typer.Option(help="Pose of the arm's base in the scene or object frame: x y z qw qx qy qz.")
-    ] = None,
-    mount_pose: Annotated[str | None, typer.Option(help="Pose of the hand in the mount: x y z qw qx qy qz.")] = None,
-    held_out: Annotated[float, typer.Option(help="For training and splits: share of held-out objects.")] = 0.2,
+    *,
+    options: ExportOptions,
     split: Annotated[str, typer.Option(help="For dexgraspbench: only one split, train or test; default: all.")] = "",
-    noise: Annotated[str, typer.Option(help="For training: noise of depth, stereo or structured_light.")] = "",
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("export"),
     json: JsonFlag = False,
 ) -> None:
     """Write grasps or pictures in other formats."""
     if format_ not in EXPORTS:
         raise InputError(f"there is no export format {format_!r}; choose one of {choices_text(format_, EXPORTS)}")
-    if depth not in ("exr", "png"):
-        raise InputError(f"there is no depth format {depth!r}; use exr or png")
+    if options.depth not in ("exr", "png"):
+        raise InputError(f"there is no depth format {options.depth!r}; use exr or png")
     if split not in ("", "train", "test"):
         raise InputError(f"there is no split {split!r}; use train or test")
     with check_written_files(output):
         if format_ in ROBOTS:
-            from graspd.exchange.robot_export import RobotExportOptions, export_grasps
+            from graspd.exchange.robot_export import export_grasps
 
-            of_robot = (best, tool, speed, arm, mount, base, mount_pose)
-            robot = RobotExportOptions(hand, object_, unvalidated, every, *of_robot)
-            done = export_grasps(Path(source), format_, robot, output)
-        elif format_ in (*TRAINING, "dexgraspbench"):
-            from graspd.exchange.training_export import TrainingExportOptions, export_bench, export_training
+            done = export_grasps(Path(source), format_, options, output)
+        elif format_ == "dexgraspbench":
+            from graspd.exchange.training_export import export_bench
 
-            training = TrainingExportOptions(hand, object_, unvalidated, every, held_out, noise)
-            if format_ == "dexgraspbench":
-                done = export_bench(source, training, split, output)
-            else:
-                done = export_training(source, format_, training, output)
+            done = export_bench(source, options, split, output)
+        elif format_ in TRAINING:
+            from graspd.exchange.training_export import export_training
+
+            done = export_training(source, format_, options, output)
         elif format_ == "webdataset":
-            done = _export_webdataset(source, output, unvalidated=unvalidated, every=every)
+            done = _export_webdataset(source, output, options)
         else:
-            done = _export_pictures(Path(source), format_, depth, output)
+            done = _export_pictures(Path(source), format_, options.depth, output)
     _report({"folder": str(output), "format": format_}, output, done, json=json)
 
 
@@ -182,12 +166,12 @@ def _export_pictures(source: Path, format_: str, depth: str, output: Path) -> Ex
     return ExportSummary({"pictures": len(views["camera/eye"]), "files": len(written)})
 
 
-def _export_webdataset(source: str, output: Path, *, unvalidated: bool, every: bool) -> ExportSummary:
+def _export_webdataset(source: str, output: Path, options: ExportOptions) -> ExportSummary:
     from graspd.exchange import webdataset
     from graspd.service.readers import Pictures
 
     shards = open_source(source)
-    written = webdataset.write(shards, output, valid=not every, unvalidated=unvalidated)
+    written = webdataset.write(shards, output, valid=not options.every, unvalidated=options.unvalidated)
     return ExportSummary({"pictures": len(Pictures(shards)), "files": len(written)})
 
 

@@ -130,7 +130,7 @@ def _read_record(path: Path, kind: str, parse: Callable[[Any], Any]) -> Any:
         return parse(loads(path.read_text()))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError):
+    except (TypeError, ValueError, RecursionError):
         raise InputError(f"{path} is no {kind}.json; `graspd {kind} --out FOLDER` writes one") from None
 
 
@@ -266,17 +266,11 @@ def _write_chart(result: dict[str, Any], out: Path | None, data_dir: Path | None
 
 
 def _read_chart(path: Path) -> dict[str, Any]:
-    def parse(document: Any) -> dict[str, Any]:
-        found = convert_chart(document)
-        if not isinstance(found, dict) or not {"created", "runs"} <= found.keys():
-            raise ValueError("no chart")
-        return found
-
-    found: dict[str, Any] = _read_record(path, "chart", parse)
+    found: dict[str, Any] = _read_record(path, "chart", lambda document: dict(convert_chart(document)))
     if "scene" in found:
         raise InputError(f"{path} is a chart of scenes; benchmarks.scenes_chart writes and publishes those")
-    if missing := [key for key in ("summary", "by_hand", "models") if key not in found]:
-        raise InputError(f"{path} has no {missing[0]}, because an earlier graspd wrote it; measure again")
+    if missing := [key for key in ("created", "runs", "summary", "by_hand", "models") if key not in found]:
+        raise InputError(f"{path} is no chart.json of this version: it has no {missing[0]}; measure again")
     return found
 
 

@@ -188,7 +188,9 @@ UNIT = re.compile(r"\[\w+\]|\b(mm|kg|kg/m3|metres|coefficient|share|candidates)\
     ],
 )
 def test_a_mistake_is_one_line(command: str, line: str) -> None:
-    done = CliRunner().invoke(build_app(), command.split(), prog_name="graspd", env={"GRASPD_API_URL": "http://[::1]:9"})
+    done = CliRunner().invoke(
+        build_app(), command.split(), prog_name="graspd", env={"GRASPD_API_URL": "http://[::1]:9"}
+    )
     assert done.exit_code == 2 and done.stderr.startswith(f"graspd: {line}") and done.stderr.count("\n") == 1
 
 

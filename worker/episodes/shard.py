@@ -4,10 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from typer import Option
 
 from graspd.service.model.errors import ConflictError, InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats
@@ -48,14 +49,13 @@ FilmMaker = Callable[[Robot, Executions], Film]
 class EpisodeOptions:
     """Options of `graspd episodes create`; see `read_robot` for the arm's."""
 
-    arm: str | None = None
-    mount: str | None = None
-    mount_pose: str | None = None
-    base: str | None = None
-    fps: float = FPS
-    seed: int = 0
-    limit: int = 0  # number of valid grasps, from the first; 0: all
-    empty: bool = False  # whether a shard without valid grasps has an empty result
+    arm: Annotated[str | None, Option(help="ur10e, franka or a URDF; default: the hand flies.")] = None
+    mount: Annotated[str | None, Option(help="Link of the arm on which the hand is mounted.")] = None
+    mount_pose: Annotated[str | None, Option(help="Pose of the hand in the mount: x y z qw qx qy qz.")] = None
+    base: Annotated[str | None, Option(help="Pose of the arm's base in the scene: x y z qw qx qy qz.")] = None
+    fps: Annotated[float, Option(min=5, max=60, help="Rate of frames [Hz].")] = FPS
+    seed: Annotated[int, Option(min=0, help="Seed of start postures and motions.")] = 0
+    limit: Annotated[int, Option(min=0, help="Number of valid grasps, from the first; 0: all.")] = 0
 
 
 def record_episodes(
@@ -67,17 +67,18 @@ def record_episodes(
     *,
     pieces: ConvexPieces | None = None,
     film: FilmMaker | None = None,
+    empty: bool = False,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Attribute]]:
     """Execute the valid grasps of a base shard; return columns and attributes of the shard of episodes.
-    `placed` are the scenes of all its grasps. Raises InputError: the grasps have no scenes, none is valid, or the robot
-    is not as `read_robot` asks."""
+    `placed` are the scenes of all its grasps. Raises InputError: the grasps have no scenes, none is valid (without
+    `empty`), or the robot is not as `read_robot` asks."""
     began = perf_counter()
     if placed is None:
         raise InputError(
             f"{base.path or 'the shard'} has free grasps; episodes need a scene: graspd synth --scene table"
         )
-    valid = validity.valid_mask(base.arrays) if options.empty else select_grasps(base)[0]
+    valid = validity.valid_mask(base.arrays) if empty else select_grasps(base)[0]
     rows = np.flatnonzero(valid)[: options.limit or None]
     robot = read_robot(hand, options.arm, mount=options.mount, mount_pose=options.mount_pose, base=options.base)
     grasps, tool = GraspSet.from_columns(base.arrays).take(rows), ToolFrame(hand.root_link, IDENTITY_POSE)

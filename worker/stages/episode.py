@@ -22,11 +22,13 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     of_scenes = np.asarray(base["grasp/scene_index"], np.intp)
     placed = assets.scenes_of(store, message, base.arrays).placed(of_scenes)
     arm = None if request.episodes == "flying" else request.episodes
-    options = EpisodeOptions(arm, fps=request.episode_fps, seed=batch_seed(message), empty=True)
+    options = EpisodeOptions(arm, fps=request.episode_fps, seed=batch_seed(message))
     pieces = assets.load_pieces(store, obj)
     films = FilmOptions(request.film, request.width, request.height, request.episode_fps)
     film = film_maker(base, films, options.seed, context.run) if request.film else None
-    columns, found = record_episodes(base, hand, obj, placed, options, pieces=pieces, film=film, run=context.run)
+    columns, found = record_episodes(
+        base, hand, obj, placed, options, pieces=pieces, film=film, empty=True, run=context.run
+    )
     attributes: dict[str, Attribute] = {name: value for name, value in found.items() if name not in _OF_TASK}
     attributes |= {"cameras": cameras_attribute(films)} if film else {}
     attributes |= {"base_shard": message.inputs[0], "scene_shard": base.attributes["scene_shard"]}
