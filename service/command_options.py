@@ -33,7 +33,7 @@ def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[...
 
 
 def with_fields(model: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorate a command: its parameter `options`, a dataclass with annotated fields, becomes one option per field."""
+    """Decorate a command: each annotated field of the dataclass `options` becomes an option."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)

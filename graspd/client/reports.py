@@ -97,7 +97,7 @@ def print_rows(
     json: bool,
     **more: Any,
 ) -> None:
-    """Print a list as `{what: [...], **more}` or as a table; `empty`: text for no rows; `whole`: no wrapping."""
+    """Print a list as JSON or as a table; `empty`: text for no rows; `whole`: columns without wrapping."""
     if json:
         items = [one.model_dump(mode="json") if isinstance(one, BaseModel) else one for one in found]
         print_json({what: items, **more})

@@ -179,7 +179,7 @@ def _load_scenes(path: Path) -> Shard:
 
 
 def _drawn_hand(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
-    """Return the best grasp of each scene: of a base shard a valid one, else a clear one for `--with-hand`."""
+    """Return the best grasp of each scene: a valid one, or for `--with-hand` a clear one."""
     if scene.kind == "base":
         unvalidated = not validity.valid_mask(scene.arrays).any()
         return sheets.best_grasps_drawn(scene, hand_of_shard(scene, hand), unvalidated=unvalidated)

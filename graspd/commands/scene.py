@@ -1,4 +1,4 @@
-"""Command line: `graspd scene` and `graspd transfer`, which transfer grasps to scenes and to other hands."""
+"""Command line: `graspd scene` and `graspd transfer`."""
 
 from __future__ import annotations
 

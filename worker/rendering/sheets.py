@@ -53,7 +53,7 @@ def best_in_scenes(base: Arrays, among: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 def best_grasps_drawn(base: Shard, hand: HandModel, *, unvalidated: bool) -> DrawnHand | None:
-    """Return the best valid grasp of each scene, if `unvalidated` the best feasible one; None without grasps."""
+    """Return the best valid or, if `unvalidated`, feasible grasp of each scene; None without grasps."""
     among = validity.selection_mask(base.arrays, unvalidated=unvalidated)
     if not len(among):
         return None
