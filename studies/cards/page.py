@@ -4,16 +4,14 @@ import json
 from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from statistics import median_high
 from typing import Any, Final
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from graspd.api.formatting import size
 from graspd.service.model.metrics import GRASP_METRICS
-from graspd.studies.figures import markdown_table
+from graspd.studies.figures import TEMPLATES, markdown_table
 from graspd.worker.quality import gate as gates
 
 Row = Mapping[str, Any]
@@ -43,14 +41,14 @@ _MEDIANS: Final = (
 def render_card(card: Row, plots: Mapping[str, str], publication: Row | None = None) -> str:
     """Return the whole page; `plots` are file names and captions.
     A `publication` has the `name` to load, `configs` of tables, `tars`, and the `unknown` licences."""
-    return _ENVIRONMENT.get_template("page.md.j2").render(
+    return TEMPLATES.get_template("cards/page.md.j2").render(
         card,
         plots=plots,
         publication=publication,
         head=yaml_head(card, publication),
         findings=findings(card),
         quality_table=quality_table(card),
-        cells_table=_cells_table(card),
+        medians=[(one.name, one.heading, one.digits or 0) for one in GRASP_METRICS if one.name in _MEDIANS],
         unfolded=_UNFOLDED,
         gate=f"penetration at most {gates.MAX_PENETRATION_MM:g} mm, self-penetration at most "
         f"{gates.MAX_SELF_PENETRATION_MM:g} mm, at least {gates.MIN_CONTACT_LINKS} links in contact",
@@ -59,7 +57,7 @@ def render_card(card: Row, plots: Mapping[str, str], publication: Row | None = N
 
 def render_croissant(card: Row, files: Sequence[Row], tables: Mapping[str, Mapping[str, tuple[str, str]]]) -> str:
     """Return the Croissant file; `files` have name, size and sha256, columns type and shape ("": scalar)."""
-    return _ENVIRONMENT.get_template("croissant.json.j2").render(card, files=files, tables=tables)
+    return TEMPLATES.get_template("cards/croissant.json.j2").render(card, files=files, tables=tables)
 
 
 def yaml_head(card: Row, publication: Row | None = None) -> dict[str, Any]:
@@ -81,7 +79,7 @@ def yaml_head(card: Row, publication: Row | None = None) -> dict[str, Any]:
 def findings(card: Row) -> list[str]:
     """Return the findings of a card's content as sentences in Markdown, with figures."""
     values = {**_elevation_findings(card), "difficult": _difficult_cells(card)}
-    lines = _ENVIRONMENT.get_template("findings.md.j2").render(card, **values).splitlines()
+    lines = TEMPLATES.get_template("cards/findings.md.j2").render(card, **values).splitlines()
     return [line for line in lines if line]
 
 
@@ -134,32 +132,6 @@ def _percentile_text(found: Row | None, digits: int) -> str:
     return f"{found['median']:.{digits}f} ({found['p5']:.{digits}f} to {found['p95']:.{digits}f})"
 
 
-def _cells_table(card: Row) -> str:
-    digits = {metric.name: (metric.heading, metric.digits or 0) for metric in GRASP_METRICS}
-    reasons = any(cell["missing_because"] for cell in card["cells"])
-    rows = []
-    for cell in card["cells"]:
-        used, types = cell["directions"], cell["types"]
-        rows.append(
-            {
-                "hand": cell_text(cell["hand"]),
-                "object": cell_text(cell["object"]),
-                "wanted": "-" if cell["asked"] is None else f"{cell['asked']:,}",
-                "candidates": f"{cell['candidates']:,}",
-                "valid": f"{cell['valid']:,}",
-                "valid of validated": percent(cell["of_validated"]),
-                **{digits[name][0]: format_fixed(cell["median"].get(name), digits[name][1]) for name in _MEDIANS},
-                "clear of table": percent(cell["clear_of_table"]),
-                "D": format_fixed(cell["diversity"], 2),
-                "share of directions used": percent(used and 1 - used["empty"] / card["directions"]["cells"]),
-                "entropy of directions, bit": format_fixed(used and used["entropy_bits"], 2),
-                "entropy of grasp types, bit": format_fixed(types and types["entropy_bits"], 2),
-                **({"missing because": cell_text(cell["missing_because"], "")} if reasons else {}),
-            }
-        )
-    return markdown_table(" | ".join(rows[0]), (list(row.values()) for row in rows), left=2)
-
-
 def cell_text(text: str | None, missing: str = "not recorded") -> str:
     return (text or missing).replace("|", "\\|").replace("\n", " ")
 
@@ -184,17 +156,7 @@ def _rejected(rejected: Mapping[str, int] | None) -> str:
     return ", ".join(parts) or ("-" if rejected is not None else "not recorded")
 
 
-# The page is Markdown, where only cells of tables need escapes.
-_ENVIRONMENT: Final = Environment(
-    loader=FileSystemLoader(Path(__file__).parent),
-    autoescape=False,
-    undefined=StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
-    keep_trailing_newline=True,
-    extensions=["jinja2.ext.do"],
-)
-_ENVIRONMENT.filters |= {
+TEMPLATES.filters |= {
     "cell": cell_text,
     "count": _count,
     "fixed": format_fixed,
