@@ -1,19 +1,11 @@
-"""Readers of published grasp sets: DDGC, DexGraspNet, MultiDex (GenDexGrasp), `reference-grasps/1`.
-
-DDGC (Lundell et al., RA-L 2021): a list of grasps per object. A grasp has position and quaternion x y z w of the hand
-in the object's frame, and eight joint angles, positive towards closing, in the order of `ROLES`.
+"""Readers of published grasp sets: DexGraspNet and `reference-grasps/1`.
 
 DexGraspNet (Wang et al., ICRA 2023): a `.npy` file per object with a list of dictionaries. `scale` multiplies the mesh.
 `qpos` has the root's translation WRJTx, y, z [m] and its rotation WRJRx, y, z: Euler angles about the fixed axes x, y,
 z in turn [rad]. Joints are `robot0:FFJ3` ... of the MuJoCo Shadow hand, with numbers one less than in the URDF.
 
-MultiDex (Li et al., GenDexGrasp, ICRA 2023): a torch file with a list `metadata` of tuples (..., q, object, robot). `q`
-has the root's translation [m], the first two columns of its rotation matrix, and the joints in the order of the robot's
-URDF. Some versions of the file have three Euler angles (rotating axes x, y, z) instead of columns.
-
 Reference grasps (`reference-grasps/1`): JSON with poses as matrices, joints by name, and published scores."""
 
-import re
 from collections import defaultdict
 from pathlib import Path
 from typing import Any, Final
@@ -31,57 +23,10 @@ from graspd.exchange.imported import (
 )
 from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
-from graspd.service.model.transforms import (
-    Floats,
-    pose_from_matrix,
-    quat_from_axis_angle,
-    quat_from_matrix,
-    quat_multiply,
-)
+from graspd.service.model.transforms import pose_from_matrix, quat_from_axis_angle, quat_multiply
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-
-#: Patterns of joint names, in the file's order: spread, medial and distal of finger 1 and 2, medial and distal of 3.
-ROLES: Final = tuple(
-    rf"(?=.*{finger}).*({words})|j{finger}{number}"
-    for finger, phalanges in (("1", "smd"), ("2", "smd"), ("3", "md"))
-    for words, number in ({"s": ("prox|spread", 1), "m": ("med", 2), "d": ("dist", 3)}[part] for part in phalanges)
-)
-
-
-def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
-    """Read grasps on object `number` of `barrett_translation_K.npy` and `barrett_representation_K.npy`.
-    Raises InputError, like all readers here: files are invalid, or hand or object do not fit."""
-    beside = path.with_name(path.name.replace("translation", "representation"))
-    if beside == path or not beside.is_file():
-        raise InputError(f"{path} needs its barrett_representation_K.npy in the same folder")
-    places, joints = (list(load_npy(file)) for file in (path, beside))
-    if number >= len(places) or len(places) != len(joints):
-        raise InputError(
-            f"{path} has {len(places)} objects and {beside.name} {len(joints)}; object {number} was requested"
-        )
-    place, values = np.asarray(places[number], float), np.asarray(joints[number], float)
-    if place.ndim != 2 or place.shape[1] != 7 or values.shape != (len(place), len(ROLES)):
-        raise InputError(f"{path}: object {number} has grasps of shape {place.shape} and joints of {values.shape}")
-    model, thing = hand_from_path(hand), scaled_object(obj)
-    pose = np.concatenate([place[:, :3], place[:, 6:], place[:, 3:6]], axis=1)
-    names = []
-    for role in ROLES:
-        found = [name for name in model.joint_names if re.search(role, name)]
-        if len(found) != 1:
-            raise InputError(f"{model.name} is no Barrett hand: not exactly one joint matches {role!r}")
-        names.append(found[0])
-    grasp = Posture(pose, joints_by_name(model, names, values * _closing_signs(model, names), what=str(path)))
-    return [ImportedGrasps(model, thing, add_postures(model, thing, grasp), thing.name)]
-
-
-def _closing_signs(hand: HandModel, names: list[str]) -> Floats:
-    """Return the sign of each joint's closing: -1 if it closes towards negative angles, else 1."""
-    order = [hand.joint_names.index(name) for name in names]
-    ends = np.array([hand.expand(limit[None])[0][order] for limit in (hand.lower, hand.upper)])
-    return np.where(ends.max(axis=0) > -ends.min(axis=0), 1.0, -1.0)
-
 
 _TRANSLATION: Final = ("WRJTx", "WRJTy", "WRJTz")
 _ROTATION: Final = ("WRJRx", "WRJRy", "WRJRz")
@@ -89,7 +34,8 @@ _MUJOCO: Final = "robot0:"
 
 
 def read_dexgraspnet(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
-    """Read an object's `.npy` file into one set of grasps for each scale."""
+    """Read an object's `.npy` file into one set of grasps for each scale.
+    Raises InputError, like all readers here: files are invalid, or hand or object do not fit."""
     found = load_npy(path)
     rows = list(found) if isinstance(found, list | np.ndarray) else []
     if not rows or not all(isinstance(row, dict) and "qpos" in row for row in rows):
@@ -126,54 +72,6 @@ def _urdf_name(name: str, hand: HandModel) -> str:
     plain = name.removeprefix(_MUJOCO)
     urdf = f"{plain[:-1]}{int(plain[-1]) + 1}"
     return next((joint for joint in hand.joint_names if joint == urdf or joint.endswith(f"_{urdf}")), urdf)
-
-
-def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: str) -> list[ImportedGrasps]:
-    """Read the grasps of one robot (`allegro`) on one object (`contactdb+mug`) in `cmap_dataset.pt`."""
-    rows = [row for row in _metadata(path) if len(row) >= 3 and row[-1] == robot and row[-2] == object_name]
-    if not rows:
-        raise InputError(f"{path} has no grasp of {robot!r} on {object_name!r}")
-    model, thing = hand_from_path(hand), scaled_object(obj)
-    q = np.stack([np.asarray(row[-3], float).ravel() for row in rows])
-    joints = len(model.joint_names)
-    if q.shape[1] not in (9 + joints, 6 + joints):
-        raise InputError(f"{path}: q has {q.shape[1]} numbers, but {model.name} needs 9 + {joints} or 6 + {joints}")
-    turn = rotation_of_columns(q[:, 3:9]) if q.shape[1] == 9 + joints else rotation_of_angles(q[:, 3:6])
-    grasp = Posture(np.concatenate([q[:, :3], turn], axis=1), q[:, -joints:])
-    return [ImportedGrasps(model, thing, add_postures(model, thing, grasp), object_name.rpartition("+")[2])]
-
-
-def rotation_of_columns(columns: Floats) -> Floats:
-    """Return quaternions (N, 4) of rotations from two columns (N, 6); both turn equally to be orthogonal."""
-    x, y = (_unit(part) for part in (columns[:, :3], columns[:, 3:]))
-    middle, across = _unit(x + y), _unit(x - y)
-    x, y = _unit(middle + across), _unit(middle - across)
-    return quat_from_matrix(np.stack([x, y, _unit(np.cross(x, y))], axis=-1))
-
-
-def rotation_of_angles(angles: Floats) -> Floats:
-    """Return quaternions (N, 4) of rotations about the rotating axes x, y, z (N, 3) [rad]."""
-    x, y, z = (quat_from_axis_angle(axis, angles[:, k]) for k, axis in enumerate(np.eye(3)))
-    return quat_multiply(x, quat_multiply(y, z))
-
-
-def _unit(vectors: Floats) -> Floats:
-    unit: Floats = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
-    return unit
-
-
-def _metadata(path: Path) -> list[Any]:
-    try:
-        import torch
-    except ModuleNotFoundError:
-        raise InputError(f"{path} is a torch file; `pip install torch` to read it") from None
-    try:
-        found = torch.load(path, map_location="cpu", weights_only=True)
-        return list(found["metadata"])
-    except Exception as error:
-        # torch raises arbitrary exceptions; all of them mean an invalid file.
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise InputError(f"{path} is no MultiDex file that can be read safely: {reason}") from None
 
 
 def read_reference(path: Path, *, hand: str | None = None, obj: str | None = None) -> list[ImportedGrasps]:

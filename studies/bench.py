@@ -15,7 +15,7 @@ import warp as wp
 from graspd.service.model.cores import available_cores
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.studies.figures import markdown_table
+from graspd.studies.figures import TEMPLATES
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -210,35 +210,7 @@ def clock_of(device: str) -> Callable[[], float]:
 
 def results_table(result: dict[str, Any]) -> str:
     """Return the result of `bench` in Markdown."""
-    rows = [
-        [
-            *(r["fidelity"], f"{r['join']} × {r['batch']}", r["processes"]),
-            *(f"{r['coarse_points']}, {r['hand_points']}", r["faces"]),
-            *(r["iterations"], f"{r['ms_per_iteration']:.2f}", f"{r['grasps_per_second']:.1f}"),
-            *(f"{100 * r['spread']:.0f} %", f"{r['peak_memory_mb']:.0f}"),
-        ]
-        for r in result["runs"]
-    ]
-    lines = [
-        f"{result['hand']} on {result['object']}, {result['device']}, graspd {result['versions']['graspd']}, "
-        f"Warp {result['versions']['warp']}",
-        "",
-        markdown_table(
-            "fidelity | batch | threads | hand points | faces | its | ms/it | grasps/s | spread | peak MB", rows
-        ),
-    ]
-    for name, phase in result["kernels"].items():
-        shares = ", ".join(f"{kernel} {100 * share:.0f} %" for kernel, share in phase["share"].items() if share >= 0.01)
-        lines += [
-            "",
-            f"{name}: {phase['points']} points, {phase['ms_per_iteration']:.2f} ms per iteration on one thread, "
-            f"{phase['iterations_to_convergence']:.0f} iterations to convergence "
-            f"({shares}); {phase['queries_per_second'] / 1e6:.2f} M distances/s",
-        ]
-    start = result["start"]
-    first, following = start["first_grasp_s"], start["next_grasp_s"]
-    lines += ["", f"In a fresh process the first grasp takes {first:.2f} s, the next {following:.2f} s."]
-    return "\n".join(lines)
+    return TEMPLATES.get_template("bench.md.j2").render(result).rstrip("\n")
 
 
 def write(result: dict[str, Any], folder: Path) -> None:

@@ -1,10 +1,23 @@
-"""Layout that all studies share: figures, their colours, and tables in Markdown."""
+"""Layout that all studies share: figures, their colours, and pages and tables in Markdown."""
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any, Final
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 INK: Final = "#1f2937"
+#: Templates of pages. These are Markdown, where only cells of tables need escapes.
+TEMPLATES: Final = Environment(
+    loader=FileSystemLoader(Path(__file__).parent),
+    autoescape=False,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+    extensions=["jinja2.ext.do"],
+)
 
 
 def new_figure(width: float, height: float) -> Any:

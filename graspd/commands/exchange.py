@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as jsonlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -31,7 +30,7 @@ app = CommandGroup(no_args_is_help=True)
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
 TRAINING: Final = ("dexlearn", "graspgen", "huggingface", "lerobot")
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
-IMPORTS: Final = ("dexgraspbench", "dexlearn", "graspgen", "dexgraspnet", "multidex", "ddgc", "reference")
+IMPORTS: Final = ("dexgraspbench", "dexlearn", "graspgen", "dexgraspnet", "reference")
 
 
 @app.command(epilog="graspd export grasps.h5 --format dexgraspbench -o bench")
@@ -89,9 +88,7 @@ def import_(
     origin: Annotated[str, typer.Option("--source", help="Source of the grasps: a URL or a citation.")],
     hand: Annotated[str | None, typer.Option(help="Hand: a URDF or a built-in.")] = None,
     object_: Annotated[str | None, typer.Option("--object", help="Mesh of the object at the source's scale 1.")] = None,
-    robot: Annotated[str, typer.Option(help="multidex: name of the robot in the file.")] = "",
-    name: Annotated[str, typer.Option(help="multidex, graspgen: name of the object.")] = "",
-    number: Annotated[int, typer.Option(help="ddgc: number of the object in the scene.")] = 0,
+    name: Annotated[str, typer.Option(help="graspgen: name of the object.")] = "",
     validation: Annotated[str, typer.Option(help="Level: dexgraspbench, standard, fast or none.")] = "standard",
     friction: Annotated[float, typer.Option(help="Coulomb friction coefficient of the metrics.")] = 1.0,
     threads: Annotated[int, typer.Option(help="CPU threads; 0: one per core.")] = 0,
@@ -108,8 +105,7 @@ def import_(
     from graspd.exchange.imported import Origin
     from graspd.exchange.scoring import write_scored
 
-    options: dict[str, Any] = {"robot": robot, "object_name": name, "number": number}
-    sets = read_sets(format_, source, hand, object_, options)
+    sets = read_sets(format_, source, hand, object_, name)
     said, run = Origin(format_, origin, licence), ExecutionContext(threads=threads)
     found = [
         _summary(write_scored(one, said, output, validation=validation, friction=friction, ordinal=k, run=run))
@@ -127,8 +123,9 @@ def import_(
     print_result({"folder": str(output), "shards": found}, "\n".join(lines), json=json)
 
 
-def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, options: dict[str, Any]) -> list[Any]:
-    """Return the sets of grasps in a file; `hand` is a URDF or built-in hand, `obj` a mesh at scale 1."""
+def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, name: str = "") -> list[Any]:
+    """Return the sets of grasps in a file; `hand` is a URDF or built-in hand, `obj` a mesh at scale 1.
+    `name` selects an object of GraspGen's files."""
     from graspd.exchange import dexgraspbench, graspgen, published
 
     if format_ not in IMPORTS:
@@ -139,19 +136,10 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
         return published.read_reference(source, hand=hand, obj=obj)
     if hand is None or obj is None:
         raise InputError(f"{format_} files contain neither hand nor object; give --hand and --object")
-    if format_ == "multidex" and not (options["robot"] and options["object_name"]):
-        raise InputError("a multidex file contains many robots and objects; select one of each by --robot and --name")
-    # Reader of each format, and names of its options.
-    readers: dict[str, tuple[Callable[..., list[Any]], tuple[str, ...]]] = {
-        "dexgraspbench": (dexgraspbench.read, ()),
-        "dexlearn": (dexgraspbench.read, ()),
-        "graspgen": (graspgen.read, ("object_name",)),
-        "dexgraspnet": (published.read_dexgraspnet, ()),
-        "ddgc": (published.read_ddgc, ("number",)),
-        "multidex": (published.read_multidex, ("robot", "object_name")),
-    }
-    read, names = readers[format_]
-    return read(source, hand=hand, obj=obj, **{name: options[name] for name in names})
+    if format_ == "graspgen":
+        return graspgen.read(source, hand=hand, obj=obj, object_name=name)
+    read = published.read_dexgraspnet if format_ == "dexgraspnet" else dexgraspbench.read
+    return read(source, hand=hand, obj=obj)
 
 
 def _export_pictures(source: Path, format_: str, depth: str, output: Path) -> ExportSummary:

@@ -1,17 +1,17 @@
-"""A card as a page: `README.md` with a YAML head for dataset hubs, from the template `page.md.j2`."""
+"""A card as a page: `README.md` with a YAML head for dataset hubs, from the templates beside this module."""
 
 import json
 from bisect import bisect_right
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from statistics import median_high
 from typing import Any, Final
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+import numpy as np
 
 from graspd.api.formatting import size
 from graspd.service.model.metrics import GRASP_METRICS
-from graspd.studies.cards.findings import findings, percent
-from graspd.studies.figures import markdown_table
+from graspd.studies.figures import TEMPLATES, markdown_table
 from graspd.worker.quality import gate as gates
 
 Row = Mapping[str, Any]
@@ -20,23 +20,14 @@ _SIZES: Final = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "n>1
 _LIMITS: Final = tuple(10**power for power in range(3, 8))
 #: Largest number of objects of a table that is not collapsed.
 _UNFOLDED: Final = 20
-_LEVELS: Final = {
-    "dexgraspbench": "MuJoCo, DexGraspBench's protocol unchanged",
-    "standard": "MuJoCo, DexGraspBench's protocol with early termination of pushes",
-    "fast": "MuJoCo with coarse physics; level standard decides cases near a limit",
-}
-#: The same for grasps planned in scenes.
-_LIFT_LEVELS: Final = {"dexgraspbench": "MuJoCo, DexGraspBench's tabletop test"} | dict.fromkeys(
-    ("standard", "fast"), "MuJoCo, lift out of the scene"
-)
 _REJECTED: Final = {
     "dropped": "rejected by the validator",
     "gate": "failed the gate",
     "not_robust": "held in too few models",
     "alike": "near-duplicates",
 }
-#: Rows of a card's origins that appear only with a value.
-_OPTIONAL: Final = frozenset({"imported from", "requirements"})
+#: A direction is preferred above this multiple of its share under uniform directions.
+_PEAKED: Final = 1.25
 #: Metrics in the table of cells.
 _MEDIANS: Final = (
     "epsilon",
@@ -50,26 +41,15 @@ _MEDIANS: Final = (
 def render_card(card: Row, plots: Mapping[str, str], publication: Row | None = None) -> str:
     """Return the whole page; `plots` are file names and captions.
     A `publication` has the `name` to load, `configs` of tables, `tars`, and the `unknown` licences."""
-    unknown = {
-        "approach directions of palms and use of joints (the hands' files are not available)": "directions.png",
-        "clearance of the table (no scenes)": "table.png",
-        "sizes of the objects": "sizes.png",
-    }
-    return _TEMPLATE.render(
+    return TEMPLATES.get_template("cards/page.md.j2").render(
         card,
         plots=plots,
         publication=publication,
         head=yaml_head(card, publication),
         findings=findings(card),
-        origins=_origins(card),
         quality_table=quality_table(card),
-        cells_table=_cells_table(card),
+        medians=[(one.name, one.heading, one.digits or 0) for one in GRASP_METRICS if one.name in _MEDIANS],
         unfolded=_UNFOLDED,
-        unknown=[
-            what
-            for what, file in unknown.items()
-            if file not in plots and not (file == "table.png" and card["making"]["scenes"])
-        ],
         gate=f"penetration at most {gates.MAX_PENETRATION_MM:g} mm, self-penetration at most "
         f"{gates.MAX_SELF_PENETRATION_MM:g} mm, at least {gates.MIN_CONTACT_LINKS} links in contact",
     )
@@ -77,7 +57,7 @@ def render_card(card: Row, plots: Mapping[str, str], publication: Row | None = N
 
 def render_croissant(card: Row, files: Sequence[Row], tables: Mapping[str, Mapping[str, tuple[str, str]]]) -> str:
     """Return the Croissant file; `files` have name, size and sha256, columns type and shape ("": scalar)."""
-    return _CROISSANT.render(card, files=files, tables=tables)
+    return TEMPLATES.get_template("cards/croissant.json.j2").render(card, files=files, tables=tables)
 
 
 def yaml_head(card: Row, publication: Row | None = None) -> dict[str, Any]:
@@ -96,34 +76,38 @@ def yaml_head(card: Row, publication: Row | None = None) -> dict[str, Any]:
     }
 
 
-def _origins(card: Row) -> dict[str, str]:
-    making, valid, threshold = card["making"], card["composition"]["valid"], card["contact_threshold_m"]
-    levels = _LIFT_LEVELS if making["scenes"] else _LEVELS
-    each = ", ".join(f"{kind} {1000 * value / (valid or 1):,.0f} s" for kind, value in making["seconds"].items())
-    total = making["seconds_per_1000_valid"]
-    rows = {
-        "method, fidelity": f"{', '.join(making['methods'])}; "
-        + ", ".join(str(found.get("name", "custom")) for found in making["fidelities"]),
-        "validation": "; ".join(levels.get(level, level) for level in making["levels"]) or "none",
-        "imported from": ", ".join(making["imported_from"]),
-        "requirements": "; ".join(cell_text(text) for text in making["requirements"]),
-        "friction of ε and Vol": ", ".join(f"{value:g}" for value in making["friction"]),
-        "contact threshold of the figures": "" if threshold is None else f"{1e3 * threshold:g} mm",
-        "seeds": ", ".join(map(str, making["seeds"])),
-        "graspd": ", ".join(making["code_versions"]),
-        "revisions of the stages": ", ".join(
-            f"{kind} {' and '.join(map(str, of))}" for kind, of in making["revisions"].items()
-        ),
-        "devices": ", ".join(making["devices"]),
-        "workers": str(making["workers"] or ""),
-        "shards written": making["first_shard"] and f"{making['first_shard'][:19]}Z to {making['last_shard'][:19]}Z",
-        "worker seconds": ", ".join(f"{kind} {value:,.0f}" for kind, value in making["seconds"].items()),
-        "seconds of base shards by part": ", ".join(
-            f"{name} {value:,.0f}" for name, value in making["synthesis_parts"].items()
-        ),
-        "per 1,000 valid grasps": f"{total:,.0f} worker seconds ({each})" if total else "",
-    }
-    return {name: value for name, value in rows.items() if value or name not in _OPTIONAL}
+def findings(card: Row) -> list[str]:
+    """Return the findings of a card's content as sentences in Markdown, with figures."""
+    values = {**_elevation_findings(card), "difficult": _difficult_cells(card)}
+    lines = TEMPLATES.get_template("cards/findings.md.j2").render(card, **values).splitlines()
+    return [line for line in lines if line]
+
+
+def _difficult_cells(card: Row) -> list[Row]:
+    """Return cells with less than half of the median yield of their hand, the lowest yields first."""
+    yields = defaultdict(list)
+    rows = [cell for cell in card["cells"] if cell["of_validated"] is not None]
+    for cell in rows:
+        yields[cell["hand"]].append(cell["of_validated"])
+    low = [cell for cell in rows if cell["of_validated"] < median_high(yields[cell["hand"]]) / 2]
+    return sorted(low, key=lambda cell: cell["of_validated"])
+
+
+def _elevation_findings(card: Row) -> dict[str, Any]:
+    """Compare elevations of palms over the table with directions drawn uniformly on the sphere.
+    Return those `preferred`, with their share and the expected one, and the share `from_above` of clear pairs."""
+    every, clear = (
+        np.sum([sums[name] for sums in card["elevation"].values()] or [[0]], axis=0) for name in ("all", "clear")
+    )
+    edges = np.linspace(-90, 90, len(every) + 1)
+    middles = (edges[1:] + edges[:-1]) / 2
+    even = np.diff(np.sin(np.radians(edges))) / 2
+    preferred = []
+    for what, chosen in (("10° of the horizontal", abs(middles) < 10), ("20° of the vertical", abs(middles) > 70)):
+        found, expected = every[chosen].sum() / max(1, every.sum()), even[chosen].sum()
+        if found > _PEAKED * expected:
+            preferred.append((what, found, expected))
+    return {"preferred": preferred, "from_above": clear[middles > 45].sum() / clear.sum() if clear.any() else None}
 
 
 def quality_table(card: Row) -> str:
@@ -148,34 +132,15 @@ def _percentile_text(found: Row | None, digits: int) -> str:
     return f"{found['median']:.{digits}f} ({found['p5']:.{digits}f} to {found['p95']:.{digits}f})"
 
 
-def _cells_table(card: Row) -> str:
-    digits = {metric.name: (metric.heading, metric.digits or 0) for metric in GRASP_METRICS}
-    reasons = any(cell["missing_because"] for cell in card["cells"])
-    rows = []
-    for cell in card["cells"]:
-        used, types = cell["directions"], cell["types"]
-        rows.append(
-            {
-                "hand": cell_text(cell["hand"]),
-                "object": cell_text(cell["object"]),
-                "wanted": "-" if cell["asked"] is None else f"{cell['asked']:,}",
-                "candidates": f"{cell['candidates']:,}",
-                "valid": f"{cell['valid']:,}",
-                "valid of validated": percent(cell["of_validated"]),
-                **{digits[name][0]: format_fixed(cell["median"].get(name), digits[name][1]) for name in _MEDIANS},
-                "clear of table": percent(cell["clear_of_table"]),
-                "D": format_fixed(cell["diversity"], 2),
-                "share of directions used": percent(used and 1 - used["empty"] / card["directions"]["cells"]),
-                "entropy of directions, bit": format_fixed(used and used["entropy_bits"], 2),
-                "entropy of grasp types, bit": format_fixed(types and types["entropy_bits"], 2),
-                **({"missing because": cell_text(cell["missing_because"], "")} if reasons else {}),
-            }
-        )
-    return markdown_table(" | ".join(rows[0]), (list(row.values()) for row in rows), left=2)
-
-
 def cell_text(text: str | None, missing: str = "not recorded") -> str:
     return (text or missing).replace("|", "\\|").replace("\n", " ")
+
+
+def percent(value: float | None) -> str:
+    if value is None:
+        return "-"
+    digits = 0 if (value >= 0.1 and round(value, 3) < 0.995) or value in (0, 1) else 1
+    return f"{100 * value:.{digits}f} %"
 
 
 def format_fixed(value: float | None, digits: int = 0) -> str:
@@ -191,19 +156,11 @@ def _rejected(rejected: Mapping[str, int] | None) -> str:
     return ", ".join(parts) or ("-" if rejected is not None else "not recorded")
 
 
-# The page is Markdown, where only cells of tables need escapes.
-_ENVIRONMENT: Final = Environment(
-    loader=FileSystemLoader(Path(__file__).parent),
-    autoescape=False,
-    undefined=StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
-    keep_trailing_newline=True,
-)
-_ENVIRONMENT.filters |= {
+TEMPLATES.filters |= {
     "cell": cell_text,
     "count": _count,
     "fixed": format_fixed,
+    "general": "{:g}".format,
     "interval": lambda found: (
         f"{percent(found['share'])} ({percent(found['low'])} to {percent(found['high'])})" if found else "unknown"
     ),
@@ -214,5 +171,3 @@ _ENVIRONMENT.filters |= {
     "rejected": _rejected,
     "size": size,
 }
-_TEMPLATE: Final = _ENVIRONMENT.get_template("page.md.j2")
-_CROISSANT: Final = _ENVIRONMENT.get_template("croissant.json.j2")

@@ -3,12 +3,11 @@
 import json
 import math
 import textwrap
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from graspd.service.model import studies
-from graspd.studies.figures import markdown_table, new_figure
+from graspd.studies.figures import TEMPLATES, new_figure
 
 #: Colours (fill, text) by outcome, distinguishable by lightness alone.
 COLOURS: Final = {
@@ -37,36 +36,8 @@ def write(found: studies.Stability, folder: Path) -> list[Path]:
 
 def markdown(found: studies.Stability) -> str:
     """Return a page in Markdown: remaining failures, then each map with symptom, guard and test."""
-    said = ", ".join(f"{name} {value}" for name, value in found.versions.items())
-    lines = ["# Failure maps", "", f"`{found.command}`; {said}.", "", *_unguarded_failures(found.maps)]
-    for one in found.maps:
-        lines += [f"## {one.title}", "", f"![{one.title}](stability-{one.name}.png)", ""]
-        lines += [f"Value of a cell: {one.measure}. {one.bounds[0].upper()}{one.bounds[1:]}.", ""]
-        panels = ([panel, *_counts(one.panel_cells(panel))] for panel in one.panels)
-        lines += [markdown_table("panel | good | weak | broken | refused", panels)]
-        lines += ["", f"- symptom: {one.shows}", f"- guard: {one.guard}"]
-        if one.guard_test:
-            lines.append(f"- test of the guard: `{one.guard_test}`")
-        lines += [f"- cells that a job can reach: {one.reach}", ""]
-    return "\n".join(lines)
-
-
-def _unguarded_failures(maps: Sequence[studies.StabilityMap]) -> list[str]:
-    """Return a section with counts of the cells that a job can reach, and with broken ones among them."""
-    lines = ["## What still breaks", ""]
-    lines += ["Counts of cells that a job can reach. Other cells need settings that jobs do not have."]
-    lines += ["", "| map | good | weak | broken | refused | remaining failures | symptom |"]
-    lines += ["| --- | --: | --: | --: | --: | --- | --- |"]
-    for one in maps:
-        broken = one.broken_cell_lines()
-        seen = one.shows if broken else "–"
-        counts = " | ".join(_counts(one.reached()))
-        lines.append(f"| {one.title} | {counts} | {'<br>'.join(broken) or 'nothing'} | {seen} |")
-    return [*lines, ""]
-
-
-def _counts(cells: Sequence[studies.MapCell]) -> list[str]:
-    return list(map(str, studies.count_outcomes(cells).values()))
+    page = TEMPLATES.get_template("stability/page.md.j2")
+    return page.render(vars(found), count_outcomes=studies.count_outcomes)
 
 
 def draw(one: studies.StabilityMap, path: Path) -> None:

@@ -86,7 +86,7 @@ def test_dexgraspnets_angles_turn_about_the_fixed_axes(tmp_path: Path) -> None:
     angles = np.array([0.4, -1.2, 2.2])
     qpos = dict(zip(("WRJRx", "WRJRy", "WRJRz"), angles, strict=True)) | {"WRJTx": 0.1, "WRJTy": 0.2, "WRJTz": -0.3}
     path = _dexgraspnet(tmp_path, qpos | {"robot0:FFJ2": 0.5}, scale=1.0)
-    (found,) = read_sets("dexgraspnet", path, "shadow", "block", {})
+    (found,) = read_sets("dexgraspnet", path, "shadow", "block")
     expected = Rotation.from_euler("xyz", angles).as_matrix()  # SciPy's lower-case letters are fixed axes too
     np.testing.assert_allclose(quat_to_matrix(found.grasps.grasp.hand_pose[0, 3:]), expected, atol=TINY)
     np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, :3], [0.1, 0.2, -0.3])
@@ -108,44 +108,6 @@ def _dexgraspnet(folder: Path, qpos: dict[str, float], scale: float) -> Path:
     return path
 
 
-def test_columns_and_rotating_axes_are_scipys_rotations() -> None:
-    rotations = Rotation.random(20, rng=np.random.default_rng(1))
-    matrices, angles = rotations.as_matrix(), rotations.as_euler("XYZ")  # capital letters are rotating axes
-    columns = np.concatenate([matrices[:, :, 0], matrices[:, :, 1]], axis=1)
-    for found in (published.rotation_of_columns(columns), published.rotation_of_angles(angles)):
-        np.testing.assert_allclose(quat_to_matrix(found), matrices, atol=1e-12)
-
-
-def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand, tmp_path: Path) -> None:
-    torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs this test")
-    joints = len(hand.joint_names)
-    q = torch.cat([torch.tensor([0.1, 0.2, 0.3, 1.0, 0, 0, 0, 1, 0]), torch.full((joints,), 0.4)])
-    rows = [(q, "ycb+block", "barrett"), (q + 1, "ycb+cup", "barrett"), (q, "ycb+block", "allegro")]
-    torch.save({"info": {}, "metadata": rows}, tmp_path / "cmap_dataset.pt")
-    options = {"robot": "barrett", "object_name": "ycb+block"}
-    (found,) = read_sets("multidex", tmp_path / "cmap_dataset.pt", "barrett", "block", options)
-    np.testing.assert_allclose(found.grasps.grasp.hand_pose, [[0.1, 0.2, 0.3, 1, 0, 0, 0]], atol=1e-6)  # float32
-    np.testing.assert_allclose(found.grasps.grasp.joint_positions, 0.4, atol=1e-6)
-
-
-def ddgc(folder: Path) -> Path:
-    """Grasps of two objects: one without an orientation, and one."""
-    place, angles = [0.1, 0.2, 0.3, 0.0, 0.0, np.sin(0.5), np.cos(0.5)], [0.1, 0.2, 0.3, 0.1, 0.5, 0.6, 0.7, 0.8]
-    for name, values in (("representation", [[angles], [angles]]), ("translation", [[place[:3]], [place]])):
-        rows = np.empty(2, dtype=object)
-        rows[:] = values
-        np.save(folder / f"barrett_{name}_3.npy", rows, allow_pickle=True)
-    return folder / "barrett_translation_3.npy"
-
-
-def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand, tmp_path: Path) -> None:
-    (found,) = read_sets("ddgc", ddgc(tmp_path), "barrett", "block", {"number": 1})
-    np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, 3:], [np.cos(0.5), 0, 0, np.sin(0.5)], atol=TINY)
-    joints = dict(zip(hand.joint_names, found.grasps.grasp.joint_positions[0], strict=True))
-    assert abs(joints["finger_3_medial"]) == pytest.approx(0.7)
-    assert abs(joints["finger_2_distal"]) == pytest.approx(0.6)
-
-
 def test_imported_grasps_are_scored_and_say_where_they_come_from(hand, block, grasps, tmp_path) -> None:
     dexgraspbench.BenchExport(tmp_path / "bench").write(hand, block, grasps, range(len(grasps)))
     (found,) = dexgraspbench.read(tmp_path / "bench", hand="barrett", obj="block")
@@ -160,7 +122,7 @@ def test_imported_grasps_are_scored_and_say_where_they_come_from(hand, block, gr
 
 def test_published_reference_grasps_come_in_by_name(shared_data: Path) -> None:
     path = shared_data / "reference_grasps" / "frogger_allegro" / "061_foam_brick.json"
-    (found,) = read_sets("reference", path, None, None, {})
+    (found,) = read_sets("reference", path, None, None)
     assert (len(found.grasps), found.name) == (28, "061_foam_brick")
     assert found.published.mean() == pytest.approx(0.64, abs=0.005)  # the rate that DATA.md states
 
@@ -180,9 +142,9 @@ def test_verdicts_are_known_or_not_and_two_scales_are_two_objects() -> None:
     ],
 )
 def test_grasps_of_a_training_format_come_back(name: str, files: str, rounding: float, exported, stored: Shard) -> None:
-    options, found = {"robot": "", "object_name": "block", "number": 0}, []
+    found = []
     for file in sorted(exported(name).glob(files)):
-        for back in read_sets(name, file, "barrett", "block", options):
+        for back in read_sets(name, file, "barrett", "block", "block"):
             assert back.published is not None and (back.placed is None) == (name == "graspgen")
             for k, pose in enumerate(back.grasps.grasp.hand_pose):
                 (row,) = np.flatnonzero(np.abs(stored["grasp/hand_pose"][:, :3] - pose[:3]).max(axis=1) < rounding)
@@ -218,9 +180,8 @@ SIX = {"task": {"obj_name": "x"}, "scene": {"x": {"pose": np.zeros(6), "scale": 
 NO_SCENE = Shard("base", {}, {"scene/object_pose": np.zeros((1, 7)), "grasp/scene_index": np.zeros(1)})
 #: What readers and writers refuse, by their words.
 REFUSED = {
-    "no import format 'foo'": lambda at: read_sets("foo", at, "h", "o", {}),
-    "give --hand and --object": lambda at: read_sets("ddgc", at, None, "o", {}),
-    "--robot and --name": lambda at: read_sets("multidex", at, "h", "o", {"robot": ""}),
+    "no import format 'foo'": lambda at: read_sets("foo", at, "h", "o"),
+    "give --hand and --object": lambda at: read_sets("graspgen", at, None, "o"),
     "no shards": expand_path,
     r"nothing\.h5 does not exist": lambda at: load_case(at / "nothing.h5"),
     "name both: --hand and --object": load_case,
@@ -235,11 +196,6 @@ REFUSED = {
     r"\(scale 0.5, scale 1\)": lambda at: load_case(kept(at, QPOS, QPOS | {"obj_scale": 0.5}), **GIVEN),
     "has a pose of 6 numbers": lambda at: object_of_scene(kept(at / "assets", SIX), "assets/0.npy"),
     "no list of grasps with `qpos`": lambda at: published.read_dexgraspnet(kept(at, np.zeros(3)) / "0.npy", **GIVEN),
-    "object 2 was requested": lambda at: published.read_ddgc(ddgc(at), number=2, **GIVEN),
-    r"grasps of shape \(1, 3\)": lambda at: published.read_ddgc(ddgc(at), **GIVEN),
-    "is no Barrett hand": lambda at: published.read_ddgc(ddgc(at), hand="allegro", obj="block", number=1),
-    "no grasp of 'a' on 'cup'": lambda at: published.read_multidex(at, robot="a", object_name="cup", **GIVEN),
-    "q has 3 numbers": lambda at: published.read_multidex(at, robot="a", object_name="mug", **GIVEN),
     "no file of reference grasps: it .* object": lambda at: stored_friction(listed(at)),
     "no record of GraspGen: it .* object": lambda at: graspgen.read(listed(at), **GIVEN),
     "has no joint 'elbow'": lambda at: joints_by_name(HAND, ["elbow"], [[0.0]], what="x"),
@@ -250,9 +206,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("words", REFUSED)
-def test_what_cannot_be_read_or_written_is_refused(words: str, tmp_path: Path, monkeypatch) -> None:
-    # torch, which reads the files of MultiDex, may be missing.
-    monkeypatch.setattr(published, "_metadata", lambda path: [(np.zeros(3), "mug", "a")])
+def test_what_cannot_be_read_or_written_is_refused(words: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=words):
         REFUSED[words](tmp_path)
 

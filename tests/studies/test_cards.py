@@ -36,9 +36,8 @@ from graspd.service.store.shards import json_attribute, read_shard
 from graspd.studies.cards import contents as card_contents
 from graspd.studies.cards.card import write_card
 from graspd.studies.cards.contents import AssetFacts, Contents, add_provenance, contents_of_folder, contents_of_store
-from graspd.studies.cards.findings import findings
 from graspd.studies.cards.numbers import card_content, share
-from graspd.studies.cards.page import render_card, yaml_head
+from graspd.studies.cards.page import findings, render_card, yaml_head
 from graspd.studies.cards.plots import draw
 from graspd.studies.cards.tally import CellTally, JointUse, Tally, cell_counts, elevations, tally_of
 from graspd.worker.hands.load import hand_from_path
