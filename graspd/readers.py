@@ -10,12 +10,7 @@ __all__ += ["hand_surface", "open_shards"]
 
 def hand_surface(shard: Any, rows: Any) -> Any:
     """Return points (K, H, 3) on the hand's surface in grasps of a base shard, in the object's frame [m].
-
-    Pass it as `hand_surface` to `Pictures.clouds` to compute graspness.
-
-    Raises:
-        NotFoundError: the shard's hand is not found.
-    """
+    Argument `hand_surface` of `Pictures.clouds`, for graspness. Raises NotFoundError: the hand is not found."""
     from graspd.worker.files.clouds import hand_surface as found
 
     return found(shard, rows)

@@ -5,11 +5,8 @@ Colour = tuple[float, float, float]
 
 def linear_rgb(red: float, green: float, blue: float) -> Colour:
     """Convert sRGB components in 0..1 to linear RGB (IEC 61966-2-1)."""
-
-    def linear_channel(c: float) -> float:
-        return c / 12.92 if c <= 0.04045 else float(((c + 0.055) / 1.055) ** 2.4)
-
-    return linear_channel(red), linear_channel(green), linear_channel(blue)
+    r, g, b = (c / 12.92 if c <= 0.04045 else float(((c + 0.055) / 1.055) ** 2.4) for c in (red, green, blue))
+    return r, g, b
 
 
 def linear_rgb_from_hex(code: str) -> Colour:

@@ -1,4 +1,4 @@
-"""A card as a page: `README.md` with a YAML head for dataset hubs, from the templates beside this module."""
+"""A card as a page: `README.md` with a YAML head for dataset hubs, from templates of this folder."""
 
 import json
 from bisect import bisect_right

@@ -40,7 +40,7 @@ from graspd.worker.objects.mesh_geometry import corner_normals, to_centred_frame
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.topology import join_meshes
 from graspd.worker.rendering.annotate import box_corners
-from graspd.worker.rendering.cameras import distance_to_fill, intrinsics, look_at
+from graspd.worker.rendering.cameras import direction_of, distance_to_fill, intrinsics, look_at
 from graspd.worker.rendering.hands import drawn_bodies, hand_parts
 from graspd.worker.rendering.kernels import exposure, raster
 from graspd.worker.rendering.kernels.shading import Light, Material
@@ -141,7 +141,8 @@ class EpisodeRenderer:
         parts = [hand_parts(model) for model, _ in robot.poses(neutral)]
         self._looks = [part.look for some in parts for part in some]
         sizes = [s.size if isinstance(s, BoxSupport) else SLAB for s in supports]
-        solids = [_box(np.array(size)) for size in sizes]
+        boxes = (hull(box_corners(np.outer([-0.5, 0.5], size))) for size in sizes)
+        solids = [Solid(corners, faces.astype(np.int32), corner_normals(corners, faces)) for corners, faces in boxes]
         solids += [Solid(o.centred.vertices, o.faces, o.corner_normals) for o in self._objects]
         solids += [part.solid for some in parts for part in some]
         self._load(solids)
@@ -251,7 +252,7 @@ class EpisodeRenderer:
 
     def _lights(self, middle: Floats, radius: float, rng: Generator) -> list[Any]:
         """Return the lights for `raster.shade`, whose shadow maps show a sphere."""
-        lamp, toward = draw_lamp(rng), _direction(rng.uniform(0, 2 * np.pi), rng.uniform(*LAMP))
+        lamp, toward = draw_lamp(rng), direction_of(rng.uniform(0, 2 * np.pi), rng.uniform(*LAMP))
         light = _LIGHT()
         for name in _LIGHT.vars:
             setattr(light, name, getattr(lamp, name))
@@ -295,7 +296,7 @@ class EpisodeRenderer:
         for _ in range(_DRAWS):
             aim = middle + rng.uniform(-AIM_M, AIM_M, 3)
             far = distance_to_fill(radius, VIEWS["scene"], rng.uniform(*FILL))
-            draws.append((aim + far * _direction(rng.uniform(0, 2 * np.pi), rng.uniform(*ELEVATION)), aim))
+            draws.append((aim + far * direction_of(rng.uniform(0, 2 * np.pi), rng.uniform(*ELEVATION)), aim))
         cameras, shares = np.stack([_camera_pose(*one) for one in draws]), []
         for t in np.linspace(0, len(poses) - 1, _MOMENTS).astype(int):
             self._place(poses[t])
@@ -337,11 +338,6 @@ class EpisodeRenderer:
         return places[int(np.argmax(free + seen))]
 
 
-def _box(size: Floats) -> Solid:
-    vertices, faces = hull(box_corners(np.stack([-0.5 * size, 0.5 * size])))
-    return Solid(vertices, faces.astype(np.int32), corner_normals(vertices, faces))
-
-
 def _quat_last(poses: Floats) -> NDArray[np.float32]:
     return np.asarray(poses[..., [0, 1, 2, 4, 5, 6, 3]], np.float32)
 
@@ -350,11 +346,6 @@ def _view_structs(poses: Floats) -> NDArray[Any]:
     views: NDArray[Any] = np.zeros(len(poses), _VIEW.numpy_dtype())
     views["place"], views["inverse"] = _quat_last(poses), _quat_last(invert(poses))
     return views
-
-
-def _direction(azimuth: float, elevation: float) -> Floats:
-    flat = np.cos(elevation)
-    return np.array([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)])
 
 
 def _camera_pose(eye: Floats, target: Floats, up: Sequence[float] | Floats = (0.0, 0.0, 1.0)) -> Floats:

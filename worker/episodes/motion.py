@@ -1,5 +1,10 @@
-"""Motions: timed targets of a robot for one grasp, from its home posture to the lifted object."""
+"""Motions: timed targets of a robot for one grasp, from its home posture to the lifted object.
 
+An arm's transit is a path of RRT-Connect (Kuffner and LaValle 2000), shortened at random. The seed alone determines it;
+in OMPL, one random generator serves the whole process."""
+
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,7 +17,6 @@ from graspd.worker.episodes.execution import Executions, Path, straight_paths
 from graspd.worker.episodes.reach import ArmScene, ReachSearch, reason_stage
 from graspd.worker.episodes.robots import rotation_between
 from graspd.worker.episodes.timing import MotionLimits
-from graspd.worker.episodes.transit import connect
 from graspd.worker.hands.model import HandModel
 from graspd.worker.validation.decomposition import ConvexPieces
 
@@ -36,7 +40,13 @@ CONTROLS: Final = (12, 24, 48)
 WIDER: Final = 1.5
 #: Number of an arm's motions to the grasp from which a transit is tried.
 MOST_TRANSITS: Final = 3
-_NO_TRANSIT: Final = EpisodeOutcome.NO_TRANSIT
+#: Length of a tree's steps and largest distance of tested points, by the joint that moves most [rad or m].
+STEP: Final = 0.25
+RESOLUTION: Final = 0.03
+#: Numbers of samples until the search ends without a path, and of attempts to shorten a path.
+SAMPLES: Final = 400
+SHORTCUTS: Final = 60
+_Test = Callable[[Floats], bool]
 
 
 @dataclass(frozen=True)
@@ -82,7 +92,7 @@ class MotionPlanner:
             corners[1:-1, 2] = max(home[2], end[2]) + height
             if (transit := self._free_path(corners, row)) is not None:
                 return self._timed([transit, *paths])
-        return _NO_TRANSIT
+        return EpisodeOutcome.NO_TRANSIT
 
     def _plan_arm(self, row: int, rng: np.random.Generator) -> Motion | EpisodeOutcome:
         reason, tried = "", 0
@@ -93,10 +103,10 @@ class MotionPlanner:
             paths = [self._states(path) for path in ways]
             if (transit := self._arm_transit(paths[0][0], row, rng)) is not None:
                 return self._timed([transit, *paths])
-            tried += 1
-            if tried == MOST_TRANSITS:
+            if (tried := tried + 1) == MOST_TRANSITS:
                 break
-        return _NO_TRANSIT if tried else EpisodeOutcome(EpisodeOutcome.OUT_OF_REACH + reason_stage(reason))
+        code = EpisodeOutcome.OUT_OF_REACH + reason_stage(reason)
+        return EpisodeOutcome.NO_TRANSIT if tried else EpisodeOutcome(code)
 
     def _states(self, path: Path) -> Floats:
         assert self.robot.arm is not None
@@ -156,3 +166,49 @@ def flying_home(hand: HandModel, rng: np.random.Generator) -> Floats:
     down = rotation_between(hand.palm.approach, np.array([0.0, 0.0, -1.0]))
     turn = quat_multiply(quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), yaw), down)
     return np.concatenate([place - quat_rotate(turn, hand.palm.centre), turn])
+
+
+def is_free_line(start: Floats, end: Floats, is_free: _Test) -> bool:
+    """Return whether points of a line (A,), at most `RESOLUTION` apart and without its start, are free."""
+    count = max(1, math.ceil(float(np.abs(end - start).max()) / RESOLUTION))
+    return all(is_free(start + (k / count) * (end - start)) for k in range(count, 0, -1))
+
+
+def connect(
+    start: Floats, goal: Floats, low: Floats, high: Floats, is_free: _Test, rng: np.random.Generator
+) -> Floats | None:
+    """Return the corners (C, A) of a free path between two configurations (A,), or None if none is found.
+    Samples are between `low` and `high` (A,)."""
+    if not (is_free(start) and is_free(goal)):
+        return None
+    # Each entry of a tree is the path from its root to a node.
+    tree, other = [[start]], [[goal]]
+    for k in range(SAMPLES):
+        if _extend(tree, rng.uniform(low, high), is_free) is not None:
+            while (joined := _extend(other, tree[-1][-1], is_free)) is False:
+                pass
+            if joined:
+                path = [*tree[-1], *other[-1][-2::-1]]
+                return _shortened(path if k % 2 == 0 else path[::-1], is_free, rng)
+        tree, other = other, tree
+    return None
+
+
+def _extend(tree: list[list[Floats]], towards: Floats, is_free: _Test) -> bool | None:
+    """Add a node at most `STEP` nearer to a point. Return whether it is there; None without a free step."""
+    near = tree[int(np.argmin(np.linalg.norm([path[-1] for path in tree] - towards, axis=1)))]
+    way = towards - near[-1]
+    share = min(1.0, STEP / max(float(np.abs(way).max()), 1e-12))
+    node = near[-1] + share * way
+    if not is_free_line(near[-1], node, is_free):
+        return None
+    tree.append([*near, node])
+    return share == 1.0
+
+
+def _shortened(path: list[Floats], is_free: _Test, rng: np.random.Generator) -> Floats:
+    for _ in range(SHORTCUTS):
+        i, j = sorted(rng.choice(len(path), 2, replace=False))
+        if j - i > 1 and is_free_line(path[i], path[j], is_free):
+            path = [*path[: i + 1], *path[j:]]
+    return np.array(path)

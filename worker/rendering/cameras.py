@@ -96,6 +96,12 @@ def distance_to_fill(radius: float, field_of_view: float, fill: float) -> float:
     return radius / float(np.sin(0.5 * fill * field_of_view))
 
 
+def direction_of(azimuth: float, elevation: float) -> Floats:
+    """Return the unit vector (3,) of an azimuth and an elevation [rad]."""
+    flat = np.cos(elevation)
+    return np.array([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)])
+
+
 def sample_hemisphere(
     centre: Floats, radius: float, *, views: int, field_of_view: float, rng: np.random.Generator
 ) -> list[Floats]:
@@ -107,10 +113,8 @@ def sample_hemisphere(
         azimuth = turn + 2 * np.pi * (view + rng.uniform(0.1, 0.9)) / views
         elevation = np.arcsin(rng.uniform(np.sin(ELEVATION[0]), np.sin(ELEVATION[1])))
         distance = max(NEAREST_M + radius, distance_to_fill(radius, field_of_view, rng.uniform(*FILL)))
-        flat = np.cos(elevation)
-        direction = np.array([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)])
         aim = centre + radius * AIM_JITTER * rng.uniform(-1, 1, 3)
-        extrinsics.append(look_at(centre + distance * direction, aim))
+        extrinsics.append(look_at(centre + distance * direction_of(azimuth, elevation), aim))
     return extrinsics
 
 

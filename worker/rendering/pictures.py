@@ -13,7 +13,7 @@ from graspd.worker.grasps import move_poses
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.rendering.cameras import Cameras, intrinsics, look_at
+from graspd.worker.rendering.cameras import Cameras, direction_of, intrinsics, look_at
 from graspd.worker.rendering.hands import drawn_bodies, hand_parts
 from graspd.worker.rendering.scenery import Appearance, CameraShot, Lamp, Solid
 from graspd.worker.rendering.tracer import Tracer
@@ -133,8 +133,7 @@ def _fit_grasp_camera(obj: ObjectModel, points: Floats, angle: float, k: Floats,
 def fit_camera(near: Floats, angle: float, k: Floats, size: tuple[int, int], *, elevation: float = ELEVATION) -> Floats:
     """Return extrinsics (4, 4) of a camera at azimuth `angle` [rad] that frames the points (P, 3)."""
     centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
-    flat = np.cos(elevation)
-    direction = np.array([np.cos(angle) * flat, np.sin(angle) * flat, np.sin(elevation)])
+    direction = direction_of(angle, elevation)
     distance = 4.0 * float(np.linalg.norm(near - centre, axis=1).max())
     # Perspective changes with the distance; after three rounds the error is below a per cent.
     for _ in range(3):

@@ -18,11 +18,19 @@ from graspd.service.model.transforms import (
 )
 from graspd.worker.episodes.episode import PHASES, EpisodeOutcome, Robot
 from graspd.worker.episodes.execution import POSTURES, Executions, ToolFrame
-from graspd.worker.episodes.motion import CLEARANCES_M, FLYING_CHANGE_M, FLYING_HOME_M, NOMINAL_S, Motion, MotionPlanner
+from graspd.worker.episodes.motion import (
+    CLEARANCES_M,
+    FLYING_CHANGE_M,
+    FLYING_HOME_M,
+    NOMINAL_S,
+    RESOLUTION,
+    Motion,
+    MotionPlanner,
+    connect,
+)
 from graspd.worker.episodes.reach import BUILTIN_ARMS, NEAR_M, read_arm
 from graspd.worker.episodes.robots import ADAPTER_M, read_robot
 from graspd.worker.episodes.timing import MotionLimits
-from graspd.worker.episodes.transit import RESOLUTION, connect
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
