@@ -108,7 +108,7 @@ _URDF = b"""<robot name="two"><link name="base"/><link name="tip"/><joint name="
 <child link="tip"/><axis xyz="0 0 1"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>"""
 #: For each parameter of a path: what of the project it may name.
 _VALUES: dict[str, tuple[str, ...]] = (
-    {"job_id": ("job_id", "failed", "waiting"), "shard_id": ("shard_id", "views"), "kind": ("object", "hand")}
+    {"job_id": ("job_id", "failed", "waiting"), "shard_id": ("shard_id", "views"), "kind": ("datasets", "jobs", "tags")}
     | {
         "digest": ("digest", "objects_digest"),
         "row": ("0",),
