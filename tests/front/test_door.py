@@ -108,7 +108,7 @@ COMMANDS = (
     *(f"export FILE.h5 --format {name} -o OUT" for name in EXPORTS),
     *(
         f"import FILE.{'json' if name == 'reference' else 'npy'} --format {name} --licence x --source y --hand allegro "
-        "--object mug --robot r --name n -o OUT"
+        "--object mug --name n -o OUT"
         for name in IMPORTS
     ),
 )

@@ -252,7 +252,7 @@ def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(standard: Verdic
     monkeypatch.setattr(screening, "RECHECK_ONE_IN", 2)
     with caplog.at_level(logging.WARNING):
         found = verdicts(ON, "fast")
-    assert found.rechecked >= found.contradicted > 1 and (found.validated_by == ValidatedBy.MUJOCO).all()
+    assert found.rechecked > 1 and (found.validated_by == ValidatedBy.MUJOCO).all()
     np.testing.assert_array_equal(found.success, standard.success)
     assert "the CPU validates all" in caplog.text
 
