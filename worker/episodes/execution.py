@@ -235,7 +235,7 @@ def time_motions(paths: Sequence[Path], names: Sequence[str], velocity: Floats, 
         seconds = max(SHORTEST_S, _STEEPEST * _shortest_duration(path, velocity) / speed)
         count = math.ceil(seconds / STEP_S)
         u = np.arange(1, count + 1) / count
-        share = u**3 * (10 - 15 * u + 6 * u**2)
+        share = minimum_jerk(u)
         phase += [path.phase] * count
         begun = time[-1]
         time += (begun + seconds * u).tolist()
@@ -250,6 +250,11 @@ def time_motions(paths: Sequence[Path], names: Sequence[str], velocity: Floats, 
     rate = np.gradient(found, when, axis=0)
     rate[[0, -1]] = 0.0
     return RobotTrajectory(tuple(names), tuple(phase), when, np.concatenate(pose), found, rate)
+
+
+def minimum_jerk(time: Floats) -> Floats:
+    """Return the share of the path after a share of the time."""
+    return time**3 * (10 - 15 * time + 6 * time**2)
 
 
 def _shortest_duration(path: Path, velocity: Floats) -> float:

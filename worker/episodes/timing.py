@@ -11,7 +11,7 @@ import numpy as np
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.episodes.episode import Robot
-from graspd.worker.episodes.execution import velocity_limits
+from graspd.worker.episodes.execution import minimum_jerk, velocity_limits
 from graspd.worker.hands.model import HandModel, JointType
 
 #: Acceleration limits of joints [rad/s^2], [m/s^2]; descriptions do not state them. An arm's is the least that is
@@ -89,11 +89,6 @@ class MotionLimits:
         at = np.concatenate([[0.0], np.cumsum(np.maximum(times, 1e-9))])
         wanted = np.linspace(0.0, at[-1], points)
         return np.stack([np.interp(wanted, at, column) for column in corners.T], axis=1)
-
-
-def minimum_jerk(time: Floats) -> Floats:
-    """Return the share of the path after a share of the time."""
-    return time**3 * (10 - 15 * time + 6 * time**2)
 
 
 def _dof_limits(tree: HandModel, acceleration: tuple[float, float]) -> Floats:
